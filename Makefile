@@ -1,0 +1,60 @@
+# Needs make and Python 3.11 to 3.13; everything else goes into .venv.
+PYTHON ?= python3
+EXTRAS ?= dev
+ARGS ?=
+TEST_ARGS ?=
+
+comma := ,
+STAMP := .venv/.installed-$(subst $(comma),-,$(EXTRAS))
+BIN := .venv/bin
+
+.PHONY: help setup train test test-slow check bench profile lock clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make train ARGS='experiment=constant70 game=breakout'   train one agent"
+	@echo "make test | test-slow | check     fast tests | the others | style and types"
+	@echo "make bench | profile              measure the parts | trace a short run"
+	@echo "make setup EXTRAS=dev,cuda        (re)install, here for an NVIDIA GPU"
+	@echo "make lock | clean                 renew requirements.lock | remove what was installed"
+
+setup: $(STAMP)
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null || \
+	  { echo "foajax: error: PYTHON=$(PYTHON): accepted is Python 3.11, 3.12 or 3.13"; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+	  { echo "foajax: error: PYTHON=$(PYTHON): its venv module is missing (on Debian: apt-get install python3-venv)"; exit 2; }
+	$(PYTHON) -m venv .venv
+
+$(STAMP): pyproject.toml requirements.lock | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[$(EXTRAS)]'
+	@touch $@
+
+train: $(STAMP)
+	$(BIN)/python -m foajax.train $(ARGS)
+
+test: $(STAMP)
+	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m 'not slow' $(TEST_ARGS)
+
+test-slow: $(STAMP)
+	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m slow $(TEST_ARGS)
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(STAMP)
+	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+profile: $(STAMP)
+	$(BIN)/python -m foajax.train profile=true $(ARGS)
+
+lock: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --upgrade --quiet \
+	  --no-emit-index-url --no-header --output-file requirements.lock pyproject.toml
+
+clean:
+	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache build dist

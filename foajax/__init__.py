@@ -1,0 +1,29 @@
+"""foajax: agents that learn what to do and where to look, with a foveated sensor, in JAX."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+__all__ = ["Agent", "Config", "ConfigError", "load_agent", "sense"]
+
+if TYPE_CHECKING:
+    from foajax.agent import Agent
+    from foajax.config import Config, ConfigError
+    from foajax.foveation import sense
+    from foajax.store import load_agent
+else:
+    _HOMES = {
+        "Agent": "agent",
+        "Config": "config",
+        "ConfigError": "config",
+        "load_agent": "store",
+        "sense": "foveation",
+    }
+
+    def __getattr__(name: str) -> Any:
+        """Fetches a public name on first use, so that `import foajax` does not wait for JAX."""
+        if name not in _HOMES:
+            raise AttributeError(f"module 'foajax' has no attribute '{name}'")
+        return getattr(importlib.import_module(f"foajax.{_HOMES[name]}"), name)

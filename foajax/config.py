@@ -1,0 +1,395 @@
+"""What a run is made of: frozen dataclasses, checked when they are built. Standard library only.
+
+A mapping (from YAML, from a command line) becomes a `Config` through `from_mapping`; whatever is
+unknown, of the wrong type or out of range raises `ConfigError` with one line that names the key,
+the value and what is accepted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be run; the message is one line for the user."""
+
+
+def _check(ok: bool, key: str, value: object, accepted: str) -> None:
+    if not ok:
+        raise ConfigError(f"{key}={_show(value)}: accepted is {accepted}")
+
+
+def _show(value: object) -> str:
+    text = str(list(value)) if isinstance(value, tuple) else str(value)
+    text = " ".join(text.split())
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+@dataclasses.dataclass(frozen=True)
+class RingSensor:
+    """A focal area of nested rings; non-FoA, Constant, Decreasing and their (P) forms (Table II)."""
+
+    rings: tuple[tuple[int, int, int], ...]  # (height, width, subsampling factor), inner to outer
+    kind: Literal["rings"] = "rings"
+    peripheral: tuple[int, int] | None = None  # grid of the coarse background, e.g. (5, 5)
+    layout: Literal["canvas", "packed"] = "canvas"
+    pooling: Literal["mean", "stride"] = "mean"
+
+    def __post_init__(self) -> None:
+        _check(len(self.rings) > 0, "sensor.rings", self.rings, "at least one [height, width, factor]")
+        for ring in self.rings:
+            height, width, factor = ring
+            _check(
+                1 <= factor <= min(height, width),
+                "sensor.rings",
+                ring,
+                "[height, width, factor] with 1 <= factor <= height and width",
+            )
+        for inner, outer in zip(self.rings, self.rings[1:], strict=False):
+            nested = inner[0] <= outer[0] and inner[1] <= outer[1] and inner[:2] != outer[:2]
+            _check(nested, "sensor.rings", self.rings, "rings that nest, each larger than the one before")
+        if self.peripheral is not None:
+            _check(min(self.peripheral) >= 1, "sensor.peripheral", self.peripheral, "null or [rows, columns] >= 1")
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Height and width of the focal area in frame pixels."""
+        return self.rings[-1][:2]
+
+
+@dataclasses.dataclass(frozen=True)
+class LogPolarSensor:
+    """A log-polar retina: rings x wedges around the focal point, radii growing geometrically."""
+
+    kind: Literal["logpolar"] = "logpolar"
+    rings: int = 35
+    wedges: int = 35
+    fovea: float = 3.0  # radius of the innermost sampling circle, frame pixels
+    radius: float = 40.0  # outer radius, frame pixels
+    sampling: Literal["area", "bilinear"] = "area"
+
+    def __post_init__(self) -> None:
+        _check(self.rings >= 2, "sensor.rings", self.rings, "an integer >= 2")
+        _check(self.wedges >= 4, "sensor.wedges", self.wedges, "an integer >= 4")
+        _check(self.fovea > 0, "sensor.fovea", self.fovea, "a radius > 0")
+        _check(self.radius > self.fovea, "sensor.radius", self.radius, f"a radius > sensor.fovea={self.fovea}")
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Height and width of the square around the outer circle, frame pixels."""
+        side = 2 * math.ceil(self.radius)
+        return side, side
+
+
+Sensor = RingSensor | LogPolarSensor
+
+
+@dataclasses.dataclass(frozen=True)
+class GazeConfig:
+    """How the focal point moves."""
+
+    mode: Literal["none", "learned", "frozen", "random", "scripted"] = "learned"
+    actions: Literal[5, 9] = 5  # stay, up, down, left, right; 9 adds the diagonals
+    step: int = 4  # frame pixels a visual action moves
+    bounds: Literal["window", "point"] = "window"  # what has to stay inside the frame
+    start: Literal["centre", "random"] | tuple[int, int] = "centre"  # at the start of an episode
+    path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn
+
+    def __post_init__(self) -> None:
+        _check(self.step >= 1, "gaze.step", self.step, "an integer >= 1")
+        if self.mode == "scripted":
+            _check(len(self.path) > 0, "gaze.path", self.path, "at least one [y, x] where gaze.mode=scripted")
+
+    @property
+    def learned(self) -> bool:
+        """Whether the network has a vision head."""
+        return self.mode == "learned"
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """The environment and its preprocessing (Table III)."""
+
+    engine: Literal["envpool", "ale"] = "envpool"
+    num_envs: int = 32
+    groups: int = 1  # sets of environments that step in turn: with 2, one decides while the other's emulators run
+    frame_shape: tuple[int, int] = (80, 80)  # what the sensor looks at
+    crop_top: Mapping[str, int] = dataclasses.field(default_factory=lambda: {"default": 34, "beam_rider": 20})
+    frame_skip: int = 4
+    noop_max: int = 30  # no-ops before an episode are drawn from [0, noop_max]
+    clip_rewards: bool = True
+    episodic_life: bool = True  # a lost life ends the learner's episode
+    fire_on_reset: bool = True
+    sticky_actions: float = 0.0  # probability that the emulator repeats the last action
+    max_episode_steps: int = 27_000  # agent steps
+    threads: int = 0  # of the engine; 0 lets it choose
+
+    def __post_init__(self) -> None:
+        _check(self.num_envs >= 1, "env.num_envs", self.num_envs, "an integer >= 1")
+        _check(self.groups >= 1, "env.groups", self.groups, "an integer >= 1")
+        _check(min(self.frame_shape) >= 8, "env.frame_shape", self.frame_shape, "[height, width], each >= 8")
+        _check("default" in self.crop_top, "env.crop_top", dict(self.crop_top), "a mapping with the key 'default'")
+        for game, row in self.crop_top.items():
+            _check(0 <= row <= 50, f"env.crop_top.{game}", row, "a screen row from 0 to 50 (160 rows are kept of 210)")
+        _check(self.frame_skip >= 1, "env.frame_skip", self.frame_skip, "an integer >= 1")
+        _check(0 <= self.noop_max <= 200, "env.noop_max", self.noop_max, "an integer from 0 to 200")
+        _check(0 <= self.sticky_actions < 1, "env.sticky_actions", self.sticky_actions, "a probability in [0, 1)")
+        _check(self.max_episode_steps >= 1, "env.max_episode_steps", self.max_episode_steps, "an integer >= 1")
+        _check(self.threads >= 0, "env.threads", self.threads, "an integer >= 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the network."""
+
+    torso: Literal["nature", "a3c"] = "nature"
+    dense: int = 256  # units between torso and LSTM; 0 for none
+    lstm: int = 256
+    normalization: Literal["running", "frame", "none"] = "running"
+
+    def __post_init__(self) -> None:
+        _check(self.dense >= 0, "network.dense", self.dense, "an integer >= 0")
+        _check(self.lstm >= 1, "network.lstm", self.lstm, "an integer >= 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class HeadConfig:
+    """What one head learns with."""
+
+    gamma: float = 0.99
+    gae_lambda: float = 0.92
+    beta: float = 0.01  # weight of the entropy
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.gamma <= 1, "gamma", self.gamma, "a number in [0, 1]")
+        _check(0 <= self.gae_lambda <= 1, "gae_lambda", self.gae_lambda, "a number in [0, 1]")
+        _check(self.beta >= 0, "beta", self.beta, "a number >= 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnerConfig:
+    """The update."""
+
+    rollout_length: int = 20  # T
+    minibatches: int = 8  # groups of environments whose gradients are applied one after another
+    epochs: int = 1  # passes over a rollout
+    clip_ratio: float | None = None  # PPO's clipping of the probability ratio; null for plain A2C
+    learning_rate: float = 3e-4
+    schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
+    adam_b1: float = 0.9
+    adam_b2: float = 0.999
+    adam_eps: float = 1e-5
+    max_grad_norm: float | None = 0.5  # of the whole gradient; null for no clipping
+    reduction: Literal["mean", "sum"] = "mean"  # of the losses over time; over environments always the mean
+    normalize_advantages: bool = False
+    value_weight: float = 0.5
+    vision_weight: float = 1.0  # of both of the vision head's losses
+    vision_bootstrap: Literal["consistent", "literal"] = "consistent"
+    natural: HeadConfig = HeadConfig()
+    vision: HeadConfig = HeadConfig()
+
+    def __post_init__(self) -> None:
+        for key in ("rollout_length", "minibatches", "epochs"):
+            _check(getattr(self, key) >= 1, f"learner.{key}", getattr(self, key), "an integer >= 1")
+        _check(self.rollout_length >= 2, "learner.rollout_length", self.rollout_length, "an integer >= 2")
+        for key in ("learning_rate", "adam_eps"):
+            _check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
+        for key in ("adam_b1", "adam_b2"):
+            _check(0 <= getattr(self, key) < 1, f"learner.{key}", getattr(self, key), "a number in [0, 1)")
+        for key in ("clip_ratio", "max_grad_norm"):
+            value = getattr(self, key)
+            _check(value is None or value > 0, f"learner.{key}", value, "null or a number > 0")
+        for key in ("value_weight", "vision_weight"):
+            _check(getattr(self, key) >= 0, f"learner.{key}", getattr(self, key), "a number >= 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """The loop around the learner."""
+
+    env_steps: int = 5_000_000  # when to stop
+    log_every: float = 10.0  # seconds
+    checkpoint_every: float = 60.0  # seconds
+    keep: int = 3  # newest checkpoints kept
+    max_skipped: int = 20  # updates in a row that may be skipped as not finite before the run stops
+
+    def __post_init__(self) -> None:
+        _check(self.env_steps >= 1, "train.env_steps", self.env_steps, "an integer >= 1")
+        for key in ("log_every", "checkpoint_every"):
+            _check(getattr(self, key) > 0, f"train.{key}", getattr(self, key), "seconds > 0")
+        for key in ("keep", "max_skipped"):
+            _check(getattr(self, key) >= 1, f"train.{key}", getattr(self, key), "an integer >= 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One run."""
+
+    name: str  # of the experiment, e.g. constant70
+    sensor: Sensor
+    game: str = "breakout"
+    seed: int = 0
+    run: str | None = None  # run directory; null for runs/<game>-<name>-s<seed>
+    profile: bool = False
+    gaze: GazeConfig = GazeConfig()
+    env: EnvConfig = EnvConfig()
+    network: NetworkConfig = NetworkConfig()
+    learner: LearnerConfig = LearnerConfig()
+    train: TrainConfig = TrainConfig()
+
+    def __post_init__(self) -> None:
+        _check(self.name.strip() != "", "name", repr(self.name), "the name of an experiment")
+        _check(self.game.strip() != "", "game", repr(self.game), "the name of a game")
+        _check(0 <= self.seed < 2**31 - 10_000, "seed", self.seed, "an integer from 0 to 2147473647")
+        height, width = self.env.frame_shape
+        if self.gaze.bounds == "window" or isinstance(self.sensor, RingSensor):
+            fits = self.sensor.window[0] <= height and self.sensor.window[1] <= width
+            _check(
+                fits,
+                "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius",
+                self.sensor.window,
+                f"a focal area inside env.frame_shape={height}x{width}",
+            )
+        if isinstance(self.sensor, RingSensor) and self.sensor.peripheral is not None:
+            rows, columns = self.sensor.peripheral
+            _check(
+                rows <= height and columns <= width,
+                "sensor.peripheral",
+                self.sensor.peripheral,
+                f"a grid no finer than env.frame_shape={height}x{width}",
+            )
+        points = self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ())
+        for point in points:
+            _check(
+                0 <= point[0] < height and 0 <= point[1] < width,
+                "gaze.start or gaze.path",
+                point,
+                f"[y, x] inside env.frame_shape={height}x{width}",
+            )
+        _check(
+            self.env.num_envs % self.learner.minibatches == 0,
+            "learner.minibatches",
+            self.learner.minibatches,
+            f"a divisor of env.num_envs={self.env.num_envs}",
+        )
+        _check(
+            self.learner.minibatches % self.env.groups == 0,
+            "env.groups",
+            self.env.groups,
+            f"a divisor of learner.minibatches={self.learner.minibatches}",
+        )
+
+    @property
+    def run_dir(self) -> str:
+        """Where the run's files are."""
+        game = "".join(c if c.isalnum() or c in "_-." else "-" for c in self.game)
+        return self.run or f"runs/{game}-{self.name}-s{self.seed}"
+
+
+def from_mapping(mapping: Mapping[str, Any]) -> Config:
+    """Builds a checked `Config` from plain nested mappings; raises `ConfigError`."""
+    return build(Config, mapping, "")
+
+
+def to_mapping(config: Any) -> dict[str, Any]:
+    """The inverse of `from_mapping`: plain dicts, lists and scalars."""
+
+    def plain(value: Any) -> Any:
+        if dataclasses.is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        if isinstance(value, Mapping):
+            return {k: plain(v) for k, v in value.items()}
+        return [plain(v) for v in value] if isinstance(value, tuple) else value
+
+    return plain(config)
+
+
+def build(cls: Any, value: Any, key: str) -> Any:
+    """A dataclass from a mapping, every field converted to its annotated type."""
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{key or 'config'}={_show(value)}: accepted is a mapping")
+    hints = typing.get_type_hints(cls)
+    names = [f.name for f in dataclasses.fields(cls)]
+    prefix = f"{key}." if key else ""
+    for name in value:
+        if name not in names:
+            raise ConfigError(
+                f"{prefix}{_show(name)}={_show(value[name])}: unknown key; accepted are {', '.join(names)}"
+            )
+    for field in dataclasses.fields(cls):
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and field.name not in value:
+            raise ConfigError(f"{prefix}{field.name}: missing; accepted is {_describe(hints[field.name])}")
+    kwargs = {name: _convert(hints[name], v, f"{prefix}{name}") for name, v in value.items()}
+    try:
+        return cls(**kwargs)
+    except ConfigError as error:
+        # A head does not know whose it is; the rest name their keys in full.
+        raise ConfigError(f"{prefix}{error}" if cls is HeadConfig else str(error)) from None
+
+
+def _convert(hint: Any, value: Any, key: str) -> Any:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint == Sensor:
+        kind = value.get("kind", "rings") if isinstance(value, Mapping) else None
+        kinds = {"rings": RingSensor, "logpolar": LogPolarSensor}
+        if isinstance(value, Mapping) and not (isinstance(kind, str) and kind in kinds):
+            raise ConfigError(f"{key}.kind={_show(kind)}: accepted is one of {', '.join(kinds)}")
+        return build(kinds.get(str(kind), RingSensor), value, key)
+    if origin in (typing.Union, types.UnionType):
+        for option in args:
+            try:
+                return _convert(option, value, key)
+            except ConfigError:
+                continue
+        raise ConfigError(f"{key}={_show(value)}: accepted is {_describe(hint)}")
+    if dataclasses.is_dataclass(hint):
+        return build(hint, value, key)
+    accepted = ConfigError(f"{key}={_show(value)}: accepted is {_describe(hint)}")
+    if origin is Literal:
+        for option in args:
+            if type(option) is type(value) and option == value:
+                return value
+        raise accepted
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise accepted
+        if args[-1] is Ellipsis:
+            return tuple(_convert(args[0], v, key) for v in value)
+        if len(value) != len(args):
+            raise accepted
+        return tuple(_convert(a, v, key) for a, v in zip(args, value, strict=True))
+    if origin is not None and issubclass(origin, Mapping):
+        if not isinstance(value, Mapping) or not all(isinstance(k, args[0]) for k in value):
+            raise accepted
+        return {k: _convert(args[1], v, f"{key}.{k}") for k, v in value.items()}
+    if hint is type(None):
+        if value is None:
+            return None
+    elif hint is float:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    elif type(value) is hint:
+        return value
+    raise accepted
+
+
+def _describe(hint: Any) -> str:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return "one of " + ", ".join(str(a) for a in args)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_describe(a) for a in args)
+    if origin is tuple:
+        if args[-1] is Ellipsis:
+            return f"a list of {_describe(args[0])}"
+        return "[" + ", ".join(_describe(a) for a in args) + "]"
+    if origin is not None:
+        return f"a mapping to {_describe(args[1])}"
+    plain = {int: "an integer", float: "a finite number", bool: "true or false", str: "a string", type(None): "null"}
+    return plain.get(hint, "a mapping")

@@ -1,0 +1,251 @@
+"""`python -m foajax.cost experiments=constant70_packed,nonfoa`: what a decision costs, sensor by sensor.
+
+A decision is sense, torso, LSTM, heads and sampling, from a frame that is preprocessed and normalised
+already; no game is started. FLOPs are XLA's count of the program *before* it is compiled for a device:
+2 for a multiply-add of a convolution or matrix product, 1 for any other elementwise operation. So they
+depend on neither the device nor what XLA fuses; but a loop counts as one turn, and thus the sensor's
+repair of an area that overhangs the frame counts even where none does. Times are medians of repeats
+that take turns, so that whatever else the machine does slows all experiments alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from foajax import cli, networks
+from foajax.agent import Agent
+from foajax.compose import compose, list_experiments
+from foajax.config import Config, ConfigError
+from foajax.foveation import pixel_count
+from foajax.types import CoreState, Params
+
+_BATCHES = (1, 32)
+_NUM_ACTIONS = 4  # Breakout's
+_REFERENCE = "nonfoa"
+_PARTS = ("sense", "network", "decision")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    experiments: str | None = None  # names with commas between them; null for all
+    torso: Literal["nature", "a3c"] = "nature"  # the group network/
+    json: str | None = None  # file for the result
+    repeats: int = 50
+
+    def __post_init__(self) -> None:
+        if self.repeats < 1:
+            raise ConfigError(f"repeats={self.repeats}: accepted is an integer >= 1")
+
+
+class Subject(NamedTuple):
+    """An experiment to be measured."""
+
+    agent: Agent
+    params: Params
+    exact: dict[str, Any]  # what is counted
+    calls: dict[str, Callable[[], Any]]  # what is timed, by the name of the result
+
+
+def measure(experiments: Sequence[str], *, torso: str, repeats: int) -> list[dict[str, Any]]:
+    """One record an experiment: what is counted, times in microseconds, ratios to `nonfoa`.
+
+    `nonfoa` is measured in any case, for the ratios.
+
+    Raises:
+      ConfigError: an unknown name.
+    """
+    names = list(dict.fromkeys([*experiments, _REFERENCE]))
+    subjects = [_subject(compose([f"experiment={name}", f"network={torso}"])) for name in names]
+    times = _time([subject.calls for subject in subjects], repeats)
+    records = [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
+    reference = records[names.index(_REFERENCE)]
+    for record in records:
+        for key in ("torso_flops", "decision_flops", *(f"decision_us_batch{batch}" for batch in _BATCHES)):
+            record[f"{key}_ratio"] = record[key] / reference[key]
+    return records
+
+
+def sense(agent: Agent, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
+    """The sensor's part of a decision."""
+    return agent.sense(frame, focal_point)
+
+
+def decide(
+    agent: Agent,
+    params: Params,
+    roi: tuple[Float[Array, "B _ _ 1"], ...],
+    focal_point: Int[Array, "B 2"],
+    core_state: CoreState,
+    key: PRNGKeyArray,
+) -> tuple[Array, Array, CoreState]:
+    """The network's part: torso to sampling, and the gaze's move."""
+    batch = focal_point.shape[0]
+    natural_key, vision_key = jax.random.split(key)
+    output, core_state = agent.network.apply(
+        params,
+        [image[None] for image in roi],
+        agent.unit(focal_point)[None],
+        jnp.zeros((1, batch), bool),
+        core_state,
+    )
+    output = jax.tree.map(lambda x: x[0], output)
+    natural_action = jax.random.categorical(natural_key, output.natural_logits)
+    vision_action, _ = agent.choose_vision(vision_key, output, False)
+    age = jnp.zeros(batch, jnp.int32)
+    return natural_action, agent.move(focal_point, vision_action, age), core_state
+
+
+def decision(
+    agent: Agent,
+    params: Params,
+    frame: Float[Array, "B H W"],
+    focal_point: Int[Array, "B 2"],
+    core_state: CoreState,
+    key: PRNGKeyArray,
+) -> tuple[Array, Array, CoreState]:
+    """Both parts as one program."""
+    return decide(agent, params, sense(agent, frame, focal_point), focal_point, core_state, key)
+
+
+def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ 1"], ...]) -> list[Array]:
+    """The convolutions alone, of every image that is large enough for them."""
+    module = {"nature": networks.NatureTorso, "a3c": networks.A3CTorso}[agent.config.network.torso]()
+    own = [params["params"].get(f"torso_{i}") for i in range(len(roi))]
+    return [module.apply({"params": p}, image) for p, image in zip(own, roi, strict=True) if p is not None]
+
+
+def flops(function: Callable[..., Any], *arguments: Any) -> int:
+    """Floating-point operations of a call, as XLA counts them before it compiles."""
+    return int(jax.jit(function).lower(*arguments).cost_analysis()["flops"])
+
+
+def _subject(config: Config) -> Subject:
+    agent = Agent(config, num_actions=_NUM_ACTIONS, crop_top=None)
+    shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
+    random = np.random.default_rng(0)
+    # The values matter to neither count nor time; initialisation as in training is slow to compile.
+    params = jax.tree.map(lambda s: jnp.asarray(random.normal(0, 0.05, s.shape), s.dtype), shapes)
+    calls = {}
+    for batch in _BATCHES:
+        for part, call in zip(_PARTS, _calls(agent, params, batch), strict=True):
+            calls[f"{part}_us_batch{batch}"] = call
+    return Subject(agent=agent, params=params, exact=_count(agent, params), calls=calls)
+
+
+def _count(agent: Agent, params: Params) -> dict[str, Any]:
+    """What is the same on every machine, at batch 1."""
+    config = agent.config
+    frame, focal_point, core_state, key = _inputs(agent, 1)
+    roi = jax.eval_shape(functools.partial(sense, agent), frame, focal_point)
+    count = pixel_count(config.sensor, config.env.frame_shape)
+    return {
+        "experiment": config.name,
+        "torso": config.network.torso,
+        "pixels_nominal": count.nominal,
+        "pixels_actual": count.actual,
+        "pixels_ratio": count.actual / math.prod(config.env.frame_shape),
+        "torso_flops": flops(functools.partial(torso, agent), params, roi),
+        "decision_flops": flops(functools.partial(decision, agent), params, frame, focal_point, core_state, key),
+        "params": sum(leaf.size for leaf in jax.tree.leaves(params)),
+    }
+
+
+def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, CoreState, Array]:
+    """A batch of frames of noise, the focal points at their centres."""
+    shape = agent.config.env.frame_shape
+    frame = jnp.asarray(np.random.default_rng(0).normal(size=(batch, *shape)), jnp.float32)
+    focal_point = jnp.tile(jnp.array(shape, jnp.int32) // 2, (batch, 1))
+    return frame, focal_point, agent.initial_state(batch).core_state, jax.random.key(0)
+
+
+def _calls(agent: Agent, params: Params, batch: int) -> list[Callable[[], Any]]:
+    """What is timed: sensor, network, and both as one program."""
+    frame, focal_point, core_state, key = _inputs(agent, batch)
+    look, think, both = (jax.jit(functools.partial(part, agent)) for part in (sense, decide, decision))
+    roi = look(frame, focal_point)
+    return [
+        functools.partial(look, frame, focal_point),
+        functools.partial(think, params, roi, focal_point, core_state, key),
+        functools.partial(both, params, frame, focal_point, core_state, key),
+    ]
+
+
+def _time(calls: Sequence[dict[str, Callable[[], Any]]], repeats: int) -> list[dict[str, float]]:
+    """Medians in microseconds; the calls take turns."""
+    for call in [call for group in calls for call in group.values()]:
+        jax.block_until_ready(call())  # compiles
+    taken: list[dict[str, list[float]]] = [{name: [] for name in group} for group in calls]
+    for _ in range(repeats):
+        for group, times in zip(calls, taken, strict=True):
+            for name, call in group.items():
+                begin = time.perf_counter()
+                jax.block_until_ready(call())
+                times[name].append(1e6 * (time.perf_counter() - begin))
+    return [{name: statistics.median(values) for name, values in times.items()} for times in taken]
+
+
+def cost(arguments: Sequence[str]) -> None:
+    """The command."""
+    options = cli.parse(Options, arguments)
+    names = list_experiments() if options.experiments is None else options.experiments.split(",")
+    if options.json and not Path(options.json).absolute().parent.is_dir():
+        raise ConfigError(f"json={options.json}: accepted is a file in a directory that exists")
+    records = measure(names, torso=options.torso, repeats=options.repeats)
+    _print(records)
+    if options.json:
+        Path(options.json).write_text(json.dumps(records, indent=1) + "\n")
+
+
+def _print(records: Sequence[dict[str, Any]]) -> None:
+    table = Table(box=box.SIMPLE, title=f"{records[0]['torso']} torso; batches of 1 | 32")
+    table.add_column("experiment", no_wrap=True)
+    for heading in ("values\nnominal", "values\nshown", "torso\nkFLOP", "decision\nkFLOP", "ratio", "params"):
+        table.add_column(heading)
+    for heading in ("sense us", "network us", "decision us", "ratio"):
+        table.add_column(f"{heading}\n1 | 32", no_wrap=True)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for record in records:
+        pairs = [" | ".join(f"{record[f'{part}_us_batch{batch}']:,.0f}" for batch in _BATCHES) for part in _PARTS]
+        ratios = " | ".join(f"{record[f'decision_us_batch{batch}_ratio']:.2f}" for batch in _BATCHES)
+        table.add_row(
+            record["experiment"],
+            f"{record['pixels_nominal']:,}",
+            f"{record['pixels_actual']:,}",
+            f"{record['torso_flops'] / 1e3:,.0f}",
+            f"{record['decision_flops'] / 1e3:,.0f}",
+            f"{record['decision_flops_ratio']:.3f}",
+            f"{record['params']:,}",
+            *pairs,
+            ratios,
+        )
+    console = Console(width=150, highlight=False)
+    console.print(table)
+    device = f"{jax.devices()[0].device_kind}, host {platform.machine()} with {os.cpu_count()} cores"
+    console.print(f"Ratios are to {_REFERENCE}. {device}, jax {jax.__version__}, jaxlib {jaxlib.__version__}.")
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(cost))

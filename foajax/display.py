@@ -1,0 +1,95 @@
+"""A run on the terminal: drawn in place on one, a line at a time elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import sys
+from collections import deque
+from collections.abc import Mapping
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+Record = Mapping[str, int | float | None]
+
+_COLUMNS = 3  # of values, side by side
+_SPEED_ROWS = 10  # rows that the shown speed is averaged over
+
+
+class Display:
+    """Shows progress and the newest row. Output that fails is dropped: there is nowhere left to say so.
+
+    Args:
+      total_env_steps: where the run ends.
+      start: ``env_steps`` and seconds at which this process takes the run up.
+      frame_skip: emulator frames an agent step.
+      live: whether to draw in place; None does so where stdout is a terminal.
+    """
+
+    def __init__(self, *, total_env_steps: int, start: tuple[int, float], frame_skip: int, live: bool | None) -> None:
+        self._total = total_env_steps
+        self._frame_skip = frame_skip
+        self._past = deque([start], maxlen=_SPEED_ROWS + 1)
+        console = Console(force_terminal=live, highlight=False)
+        wanted = sys.stdout.isatty() and not console.is_dumb_terminal if live is None else live
+        self._live = Live(console=console, auto_refresh=False) if wanted else None
+
+    def show(self, record: Record) -> None:
+        """Shows a row: ``env_steps``, ``time`` in seconds, and any further values."""
+        progress = self._progress(record)
+        values = {name: _number(value) for name, value in record.items() if name not in ("env_steps", "time")}
+        if self._live is None:
+            self.message(", ".join([progress, *(f"{name} {value}" for name, value in values.items())]))
+            return
+        done = min(int(record["env_steps"] or 0), self._total)
+        bar = Table.grid(expand=True)  # a bar alone does not end its line
+        bar.add_row(ProgressBar(total=self._total, completed=done))
+        with contextlib.suppress(OSError):
+            self._live.start()
+            self._live.update(Group(Text(progress), bar, _grid(values)), refresh=True)
+
+    def message(self, text: str) -> None:
+        """A line that stays; may come from any thread."""
+        with contextlib.suppress(OSError):
+            if self._live is None:
+                print(text, flush=True)
+            else:
+                self._live.console.print(Text(text))
+
+    def close(self) -> None:
+        """Leaves the last picture on the terminal."""
+        if self._live is not None:
+            with contextlib.suppress(OSError):
+                self._live.stop()
+
+    def _progress(self, record: Record) -> str:
+        env_steps, seconds = int(record["env_steps"] or 0), float(record["time"] or 0)
+        self._past.append((env_steps, seconds))
+        first_steps, first_seconds = self._past[0]
+        speed = (env_steps - first_steps) / max(seconds - first_seconds, 1e-3)
+        share = 100 * env_steps / self._total
+        words = [f"env_steps {env_steps:,} of {self._total:,} ({share:.1f}%)"]
+        words += [f"frames {env_steps * self._frame_skip:,}", f"{speed:,.0f} steps/s"]
+        if speed > 0:
+            left = datetime.timedelta(seconds=round(max(self._total - env_steps, 0) / speed))
+            words.append(f"{left} left")
+        return ", ".join(words)
+
+
+def _number(value: int | float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+
+
+def _grid(values: Mapping[str, str]) -> Table:
+    """Names and numbers in a few columns, filled row by row."""
+    grid = Table.grid(padding=(0, 2))
+    cells = [[Text(name, style="dim"), Text(value, justify="right")] for name, value in values.items()]
+    for i in range(0, len(cells), _COLUMNS):
+        grid.add_row(*(text for cell in cells[i : i + _COLUMNS] for text in cell))
+    return grid

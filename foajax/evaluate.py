@@ -1,0 +1,149 @@
+"""`python -m foajax.evaluate run=<dir> episodes=30`: whole games, unclipped scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from foajax import cli, envs
+from foajax.agent import Agent
+from foajax.config import Config, ConfigError
+from foajax.store import load_agent
+from foajax.types import FrameStatistics, Params
+
+_EVALUATION_SEED = 1_000_003  # apart from the seeds of training
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    run: str  # a run directory or a shipped agent
+    episodes: int = 30
+    policy: Literal["sampled", "greedy"] = "sampled"
+    json: str | None = None  # file for the result
+    num_envs: int = 30  # games played at once
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for key in ("episodes", "num_envs"):
+            if getattr(self, key) < 1:
+                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
+
+
+class Games(NamedTuple):
+    """Whole games, in the order in which they ended."""
+
+    returns: np.ndarray  # [episodes] unclipped
+    lengths: np.ndarray  # [episodes] agent steps
+
+
+def play(
+    config: Config,
+    params: Params,
+    statistics: FrameStatistics,
+    *,
+    episodes: int,
+    num_envs: int,
+    seed: int,
+    greedy: bool,
+) -> Games:
+    """Plays `episodes` games with fixed parameters, in the environment that the agent was trained in.
+
+    Every environment plays the same number of games, so that short games are not over-represented.
+    """
+    num_envs = min(num_envs, episodes)
+    rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
+    environment = envs.make(config, num_envs=num_envs, seed=_EVALUATION_SEED + seed)
+    agent = Agent(config, environment.num_actions, environment.crop_top)
+    act = jax.jit(functools.partial(agent.act, greedy=greedy))
+    state = agent.initial_state(num_envs)
+    key = jax.random.key(seed)
+    returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
+    finished: list[tuple[float, int]] = []
+    timestep, _ = environment.reset()
+    step = 0
+    while len(finished) < episodes:
+        output, _, state = act(params, statistics, state, timestep, jax.random.fold_in(key, step))
+        environment.send(np.asarray(output.natural_action))
+        timestep, outcome = environment.recv()
+        returns += outcome.score
+        lengths += 1 - timestep.is_first
+        for i in np.flatnonzero(outcome.is_over):
+            if games[i] < rounds[i]:
+                finished.append((float(returns[i]), int(lengths[i])))
+            games[i] += 1
+            returns[i], lengths[i] = 0, 0
+        step += 1
+    environment.close()
+    return Games(returns=np.array([r for r, _ in finished]), lengths=np.array([n for _, n in finished]))
+
+
+def evaluate(arguments: Sequence[str]) -> None:
+    """The command."""
+    options = cli.parse(Options, arguments)
+    stored = load_agent(options.run)
+    config = stored.agent.config
+    games = play(
+        config,
+        stored.params,
+        stored.statistics,
+        episodes=options.episodes,
+        num_envs=options.num_envs,
+        seed=options.seed,
+        greedy=options.policy == "greedy",
+    )
+    result = {
+        "run": options.run,
+        "game": config.game,
+        "experiment": config.name,
+        "env_steps": stored.env_steps,
+        "policy": options.policy,
+        "seed": options.seed,
+        "episodes": options.episodes,
+        "mean": float(games.returns.mean()),
+        "stderr": standard_error(games.returns),
+        "returns": games.returns.tolist(),
+        "lengths": games.lengths.tolist(),
+    }
+    _print(result)
+    if options.json:
+        Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
+
+
+def standard_error(returns: np.ndarray) -> float | None:
+    """Of the mean; None for a single game."""
+    return float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None
+
+
+def _print(result: dict) -> None:
+    table = Table("game", "experiment", "policy", "games", "mean", "std. error", "min", "median", "max", "steps a game")
+    returns = np.array(result["returns"])
+    error = "" if result["stderr"] is None else f"{result['stderr']:.2f}"
+    table.add_row(
+        result["game"],
+        result["experiment"],
+        result["policy"],
+        str(len(returns)),
+        f"{returns.mean():.2f}",
+        error,
+        f"{returns.min():.0f}",
+        f"{np.median(returns):.1f}",
+        f"{returns.max():.0f}",
+        f"{np.mean(result['lengths']):.0f}",
+    )
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(evaluate))

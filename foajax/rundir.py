@@ -1,0 +1,245 @@
+"""A run's directory: held by one process at a time, and for one meaning of the configuration.
+
+    config.yaml   the resolved configuration
+    run.json      every start: command, versions, commit, machine, time
+    lock          locked by the process that trains; names it
+
+Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (checkpoint).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import fcntl
+import importlib.metadata
+import json
+import os
+import platform
+import socket
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from foajax import durable
+from foajax.config import Config, ConfigError, from_mapping, to_mapping
+
+_CONFIG = "config.yaml"
+_PACKAGES = (
+    "foajax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "numpy",
+    "envpool",
+    "ale-py",
+    "gymnasium",
+)
+# What may change between two starts of a run: none of it changes what a step learns.
+_FREE = {
+    *("run", "profile", "env.threads"),
+    *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep", "train.max_skipped"),
+}
+
+
+class RunError(ConfigError):
+    """A run directory that cannot be used; the message is one line for the user."""
+
+
+class RunDir:
+    """A run's directory, held by this process until `close` or the end of a `with`."""
+
+    def __init__(self, path: Path, lock: int) -> None:
+        self.path = path
+        self._lock = lock
+
+    def close(self) -> None:
+        """Lets another process have the directory."""
+        if self._lock >= 0:
+            os.close(self._lock)
+        self._lock = -1
+
+    def __enter__(self) -> RunDir:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
+    """Creates or reopens ``config.run_dir`` and holds it.
+
+    The lock is the kernel's: it ends with the process, however that ends. ``config.yaml`` is written, or
+    compared with what is there: a key that changes what is learned has to have its old value, the others
+    (lengths, intervals, threads) are taken over. ``run.json`` gains an entry.
+
+    Args:
+      config: the run that is asked for.
+      command: the words that started this process, for the record.
+
+    Raises:
+      RunError: the directory cannot be created, written or read, is in use, or holds another run.
+    """
+    path = Path(config.run_dir)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise RunError(f"run={path}: is a file; accepted is a directory") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"run={path}: cannot be created ({_reason(error)}); choose another run=<dir>") from None
+    run_dir = RunDir(path, _take_lock(path))
+    try:
+        _settle_config(path, config)
+        _record_start(path, command)
+    except OSError as error:
+        run_dir.close()
+        raise RunError(f"run={path}: cannot be used ({_reason(error)}); choose another run=<dir>") from None
+    except BaseException:
+        run_dir.close()
+        raise
+    return run_dir
+
+
+def load_config(path: str | os.PathLike[str]) -> Config:
+    """The configuration of the run in `path`, with ``run`` set to `path`.
+
+    Raises:
+      RunError: there is no such directory, it is no run, or its ``config.yaml`` cannot be read.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RunError(f"run={path}: does not exist; accepted is the directory of a run")
+    if not path.is_dir():
+        raise RunError(f"run={path}: is a file; accepted is the directory of a run")
+    file = path / _CONFIG
+    try:
+        mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if not isinstance(mapping, dict):
+            raise ConfigError("is not the configuration of a run (no mapping)")
+        config = from_mapping(mapping)
+    except FileNotFoundError:
+        raise RunError(f"run={path}: has no {_CONFIG}; accepted is the directory of a run") from None
+    except ConfigError as error:
+        raise RunError(f"{file}: {error}") from None
+    except OSError as error:
+        raise RunError(f"{file}: cannot be read ({_reason(error)})") from None
+    except Exception as error:  # a file of any content ends up here
+        raise RunError(f"{file}: is not the configuration of a run ({_reason(error)})") from None
+    return dataclasses.replace(config, run=str(path))
+
+
+def _take_lock(path: Path) -> int:
+    try:
+        lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise RunError(f"run={path}: cannot be written ({_reason(error)}); choose another run=<dir>") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+        os.write(lock, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+    except BlockingIOError:
+        holder = os.read(lock, 200).decode(errors="replace").strip() or "another process"
+        os.close(lock)
+        raise RunError(f"run={path}: in use by {holder}; end it or choose another run=<dir>") from None
+    except OSError as error:
+        os.close(lock)
+        raise RunError(f"run={path}: cannot be locked ({_reason(error)}); choose another run=<dir>") from None
+    return lock
+
+
+def _settle_config(path: Path, config: Config) -> None:
+    """Writes ``config.yaml`` if it is new or differs in ways that may; RunError if in others."""
+    text = yaml.safe_dump(to_mapping(config), sort_keys=False)
+    file = path / _CONFIG
+    if os.path.lexists(file):
+        stored, asked = (dict(_flatten(to_mapping(c))) for c in (load_config(path), config))
+        # With a falling learning rate the length of the run is part of what a step learns.
+        free = _FREE - {"train.env_steps"} if config.learner.schedule == "linear" else _FREE
+        keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
+        if keys:
+            old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
+            remedy = "choose another run=<dir> or restore the value"
+            raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
+        if file.read_text(encoding="utf-8") == text:
+            return
+    durable.replace(file, text.encode())
+
+
+def _flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and their values."""
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _show(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _record_start(path: Path, command: Sequence[str]) -> None:
+    file = path / "run.json"
+    try:
+        record = json.loads(file.read_text(encoding="utf-8")) if os.path.lexists(file) else {"starts": []}
+        record["starts"].append(_describe_start(command))
+    except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
+        raise RunError(f"{file}: is not the record of a run; move it away") from None
+    durable.replace(file, (json.dumps(record, indent=1) + "\n").encode())
+
+
+def _describe_start(command: Sequence[str]) -> dict[str, Any]:
+    return {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": list(command),
+        "directory": os.getcwd(),
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        "system": platform.platform(),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit of the checkout this package runs from, with "-dirty" after changes; None elsewhere."""
+    package = Path(__file__).resolve().parent
+    # An installed package may lie inside the checkout of something else.
+    if not (package.parent / ".git").exists():
+        return None
+    words = ["git", "-C", str(package), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        result = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip() or None
+
+
+def _cpu() -> str:
+    """The processor's model where the system says it, else its architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
+
+
+def _reason(error: Exception) -> str:
+    text = getattr(error, "strerror", None) or " ".join(str(error).split())
+    return text if len(text) <= 200 else text[:197] + "..."

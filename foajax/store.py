@@ -1,0 +1,118 @@
+"""Trained agents on disk: `agent.json` and `config.yaml` beside either checkpoints or one safetensors file.
+
+A run directory and a shipped agent are read alike. `python -m foajax.store run=<dir> out=<dir>` makes the latter
+from the former: parameters and frame statistics only, readable without this package.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import yaml
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from foajax import cli
+from foajax.agent import Agent
+from foajax.checkpoint import Checkpoints
+from foajax.config import ConfigError, to_mapping
+from foajax.programs import make_state
+from foajax.rundir import load_config
+from foajax.types import FrameStatistics, Params
+
+_FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
+_PARAMETERS = "agent.safetensors"
+CHECKPOINTS = "checkpoints"
+
+
+class Stored(NamedTuple):
+    """An agent read from disk."""
+
+    agent: Agent
+    params: Params
+    statistics: FrameStatistics
+    env_steps: int  # it has been trained for
+
+
+def save_facts(agent: Agent, directory: Path, **more: int) -> None:
+    """Writes what `load_agent` needs beside `config.yaml`."""
+    facts = {"num_actions": agent.num_actions, "crop_top": agent.crop_top}
+    (directory / _FACTS).write_text(json.dumps(facts | more) + "\n")
+
+
+def load_agent(path: str | Path) -> Stored:
+    """Reads a run directory (newest good checkpoint) or a shipped agent; raises `ConfigError`."""
+    path = Path(path)
+    config = load_config(path)
+    try:
+        facts = json.loads((path / _FACTS).read_text())
+        agent = Agent(config, facts["num_actions"], facts["crop_top"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"run={path}: {_FACTS} is missing or not readable; accepted is a run or an agent") from None
+    if (path / _PARAMETERS).exists():
+        return _load_shipped(agent, path / _PARAMETERS, facts.get("env_steps", 0))
+    template = jax.eval_shape(lambda: make_state(agent, 0))
+    checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
+    restored = checkpoints.restore_part({"train": template})
+    if restored is None:
+        raise ConfigError(f"run={path}: has no checkpoint yet")
+    env_steps, state, _ = restored
+    return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
+
+
+def save_agent(stored: Stored, directory: Path) -> None:
+    """Writes a shipped agent: float32 arrays by name, the configuration and the facts."""
+    directory.mkdir(parents=True, exist_ok=True)
+    arrays = _named((stored.params, stored.statistics))
+    save_file(arrays, directory / _PARAMETERS)
+    config = to_mapping(stored.agent.config)
+    (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+    save_facts(stored.agent, directory, env_steps=stored.env_steps)
+
+
+def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
+    template = jax.eval_shape(lambda: make_state(agent, 0))
+    wanted = (template.params, template.statistics)
+    try:
+        arrays = load_file(file)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"run={file.parent}: {file.name} is not readable: {str(error).splitlines()[0]}") from None
+    names = _named(wanted)
+    if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
+        raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
+    leaves = [arrays[name] for name in names]
+    params, statistics = jax.tree.unflatten(jax.tree.structure(wanted), leaves)
+    return Stored(agent, params, statistics, env_steps)
+
+
+def _named(tree) -> dict:
+    """Leaves by their path, e.g. `0/params/dense/kernel`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    run: str
+    out: str
+
+
+def export(arguments: Sequence[str]) -> None:
+    """The command."""
+    options = cli.parse(Options, arguments)
+    save_agent(load_agent(options.run), Path(options.out))
+    print(f"{options.out}: {_PARAMETERS}, config.yaml, {_FACTS}")
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(export))

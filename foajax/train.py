@@ -1,0 +1,216 @@
+"""`python -m foajax.train experiment=constant70 game=breakout`: trains one agent, or goes on training it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+import jax
+import numpy as np
+
+from foajax import compose, envs, profiling
+from foajax.agent import Agent
+from foajax.checkpoint import Checkpoints
+from foajax.config import Config, ConfigError
+from foajax.learner import Metrics
+from foajax.logger import EpisodeTracker, Logger
+from foajax.programs import make_programs, make_state
+from foajax.rollout import Collector
+from foajax.rundir import RunDir, open_run
+from foajax.store import CHECKPOINTS, save_facts
+from foajax.types import Outcome, Rollout
+
+_GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best
+
+
+class StopRequest:
+    """Turns SIGINT, SIGTERM and SIGUSR1 (a cluster's preemption) into a flag; a second SIGINT interrupts at once."""
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.name is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.name = signal.Signals(number).name
+
+
+class Run:
+    """One run's parts, wired together, at the point where its newest checkpoint left it."""
+
+    def __init__(self, config: Config, run_dir: RunDir, resources: contextlib.ExitStack) -> None:
+        self._config = config
+        self._say = lambda text: print(text, file=sys.stderr, flush=True)  # until there is a logger
+        self._rollout_steps = config.env.num_envs * config.learner.rollout_length
+        self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=config.train.keep, warn=self._warn)
+        # Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it got.
+        environments = make_environments(config, max(self._checkpoints.steps(), default=0))
+        for environment in environments:
+            resources.callback(environment.close)
+        agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
+        save_facts(agent, run_dir.path)
+        self._programs = make_programs(agent)
+        self._collector = Collector(agent, self._programs, environments, seed=config.seed)
+        self._tracker = EpisodeTracker(config.env.num_envs)
+        self._state = make_state(agent, config.seed)
+        self._env_steps = self._restore()
+        self._logger = resources.enter_context(
+            Logger(
+                run_dir.path,
+                total_env_steps=config.train.env_steps,
+                start_env_steps=self._env_steps,
+                frame_skip=config.env.frame_skip,
+            )
+        )
+        resources.enter_context(self._checkpoints)
+        self._say = self._logger.message
+        self._say(f"{run_dir.path}: {self._how_it_starts()}")
+
+    def loop(self, stop: StopRequest) -> None:
+        """Rollouts and updates until `train.env_steps` or a request to stop; saves in the end, whatever ends it."""
+        try:
+            self._loop(stop)
+        finally:
+            self._checkpoints.wait()
+            self._save()
+        self._say(self._how_it_ends(stop))
+
+    def _loop(self, stop: StopRequest) -> None:
+        train = self._config.train
+        logged = saved = time.monotonic()
+        metrics: list[Metrics] = []
+        while self._env_steps < train.env_steps and stop.name is None:
+            step = self._env_steps // self._config.env.num_envs
+            rollouts, outcomes = self._collector.collect(self._state, step)
+            # Fetched one rollout late: by now they are there, and nothing waits for the device.
+            self._check(metrics)
+            now = time.monotonic()
+            if metrics and now - logged >= train.log_every:
+                self._log(metrics)
+                logged = now
+            metrics = self._update(rollouts)
+            self._track(outcomes)
+            self._env_steps += self._rollout_steps
+            if now - saved >= train.checkpoint_every:
+                self._save()
+                saved = now
+        self._check(metrics)
+        if metrics:
+            self._log(metrics)
+
+    def _update(self, rollouts: list[Rollout]) -> list[Metrics]:
+        """All minibatches of the groups' rollouts, `epochs` times, one after another."""
+        learner = self._config.learner
+        metrics = []
+        for epoch in range(learner.epochs):
+            for rollout in rollouts:
+                for index in range(learner.minibatches // len(rollouts)):
+                    self._state, row = self._programs.update(
+                        self._state, rollout, np.int32(index), np.bool_(epoch == 0)
+                    )
+                    metrics.append(row)
+        return metrics
+
+    def _check(self, metrics: list[Metrics]) -> None:
+        """Stops a run whose updates are not finite time after time."""
+        if metrics and int(metrics[-1]["skipped_in_a_row"]) >= self._config.train.max_skipped:
+            raise ConfigError(
+                f"train.max_skipped={self._config.train.max_skipped}: so many updates in a row were not finite; "
+                f"the last good parameters are kept at {self._env_steps} env_steps; "
+                "accepted is what a smaller learner.learning_rate or learner.max_grad_norm may give"
+            )
+
+    def _track(self, outcomes: list[list[Outcome]]) -> None:
+        for step in zip(*outcomes, strict=True):
+            self._tracker.add(Outcome(*(np.concatenate(field) for field in zip(*step, strict=True))))
+
+    def _log(self, metrics: list[Metrics]) -> None:
+        rows = jax.device_get(metrics)
+        means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0] if name != "skipped_in_a_row"}
+        self._logger.write(
+            {
+                "env_steps": self._env_steps,
+                "games": self._tracker.games,
+                "score": self._tracker.mean_score,
+                "length": self._tracker.mean_length,
+                **means,
+            }
+        )
+
+    def _save(self) -> None:
+        meta: dict[str, Any] = {"tracker": self._tracker.get_state()}
+        if self._tracker.games >= _GAMES_FOR_A_SCORE:
+            meta["score"] = self._tracker.mean_score
+        self._checkpoints.save(self._env_steps, self._everything(), meta)
+
+    def _restore(self) -> int:
+        """Takes over the newest good checkpoint; returns its env_steps."""
+        restored = self._checkpoints.restore(self._everything())
+        if restored is None:
+            return 0
+        self._state = restored.state["train"]
+        self._collector.set_state(restored.state["collector"])
+        self._tracker.set_state(restored.meta["tracker"], same_games=self._collector.resumable)
+        return restored.env_steps
+
+    def _everything(self) -> dict[str, Any]:
+        return {"train": self._state, "collector": self._collector.get_state()}
+
+    def _how_it_starts(self) -> str:
+        if not self._env_steps:
+            return f"new run of {self._config.name} on {self._config.game}"
+        games = "episodes go on" if self._collector.resumable else "episodes start anew, emulators cannot be saved"
+        return f"resumed at {self._env_steps:,} env_steps ({games})"
+
+    def _how_it_ends(self, stop: StopRequest) -> str:
+        if stop.name is None:
+            return f"done: {self._env_steps:,} env_steps"
+        return f"{stop.name}: saved at {self._env_steps:,} env_steps; the same command goes on from here"
+
+    def _warn(self, text: str) -> None:
+        self._say(f"warning: {text}")
+
+
+def environment_seed(seed: int, env_steps: int, group: int) -> int:
+    """Apart for every run, group and start: an engine adds its environments' numbers to one seed."""
+    return int(np.random.SeedSequence([seed, env_steps, group]).generate_state(1)[0] >> 2)
+
+
+def make_environments(config: Config, env_steps: int) -> list[envs.Environment]:
+    """The groups of environments of a run that starts at `env_steps`."""
+    batch = config.env.num_envs // config.env.groups
+    seeds = [environment_seed(config.seed, env_steps, group) for group in range(config.env.groups)]
+    return [envs.make(config, num_envs=batch, seed=seed) for seed in seeds]
+
+
+def use_compilation_cache() -> None:
+    """Compiled programs are kept for the next start, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        jax.config.update("jax_compilation_cache_dir", os.path.join(cache, "foajax"))
+
+
+def train(config: Config) -> None:
+    """One run from its newest checkpoint, or from nothing, to `train.env_steps`; or a profile of it."""
+    use_compilation_cache()
+    with contextlib.ExitStack() as resources:
+        if config.profile:
+            environments = make_environments(config, 0)
+            for environment in environments:
+                resources.callback(environment.close)
+            profiling.profile(config, environments, f"{config.run_dir}/profile")
+            return
+        stop = StopRequest()
+        run_dir = resources.enter_context(open_run(config, command=[sys.executable, *sys.argv]))
+        Run(config, run_dir, resources).loop(stop)
+
+
+if __name__ == "__main__":
+    sys.exit(compose.run(train, sys.argv[1:]))

@@ -1,0 +1,96 @@
+"""The records that travel between the parts. Every field carries its shape.
+
+T rollout length, B environments, H W frame, A natural and V visual actions, L width of the LSTM.
+One progress unit everywhere: ``env_steps``, agent steps summed over environments.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+HostArray = Array | np.ndarray  # environments give NumPy arrays
+Params = Any  # the network's parameters, a pytree of float32 arrays
+
+
+class TimeStep(NamedTuple):
+    """What an environment shows after a step; the part that goes to the device."""
+
+    frame: UInt8[HostArray, "B ..."]  # screen, gray, 0..255, as the environment draws it
+    reward: Float[HostArray, "B"]  # what is learned from (clipped where asked), result of the last action
+    is_first: Bool[HostArray, "B"]  # an episode starts here: the last action was ignored, reward is 0
+    is_terminal: Bool[HostArray, "B"]  # the episode ends here and nothing follows: the value is 0
+
+
+class Outcome(NamedTuple):
+    """The part of a step that stays on the host: whole games, as a player counts them."""
+
+    score: Float[HostArray, "B"]  # unclipped reward of this step
+    is_over: Bool[HostArray, "B"]  # the whole game ended here (a lost life is not enough)
+
+
+class CoreState(NamedTuple):
+    """Carry of the LSTM."""
+
+    cell: Float[Array, "B L"]
+    hidden: Float[Array, "B L"]
+
+
+class ActorState(NamedTuple):
+    """What an actor remembers between two steps."""
+
+    core_state: CoreState
+    focal_point: Int[Array, "B 2"]  # (y, x) in frame pixels, used to sense the next frame
+    age: Int[Array, "B"]  # steps since the episode began, for a scripted gaze
+
+
+class NetworkOutput(NamedTuple):
+    """The four outputs of the two heads; the vision head's are None where gaze is not learned."""
+
+    natural_logits: Float[Array, "... A"]
+    natural_value: Float[Array, "..."]
+    vision_logits: Float[Array, "... V"] | None
+    vision_value: Float[Array, "..."] | None
+
+
+class ActorOutput(NamedTuple):
+    """What is recorded of one decision. In a rollout each field gains a leading [T+1]."""
+
+    roi: tuple[Float[Array, "B h w c"], ...]  # what the sensor gave, one image a part
+    focal_point: Int[Array, "B 2"]  # where it was sensed
+    natural_action: Int[Array, "B"]
+    vision_action: Int[Array, "B"]  # 0 where gaze is not learned
+    natural_log_prob: Float[Array, "B"]  # of the action, when it was chosen
+    vision_log_prob: Float[Array, "B"]
+    reward: Float[Array, "B"]  # of the time step acted on
+    is_first: Bool[Array, "B"]
+    is_terminal: Bool[Array, "B"]
+    frame_mean: Float[Array, "B"]  # of the frame before normalisation, for the running statistics
+    frame_std: Float[Array, "B"]
+
+
+class Rollout(NamedTuple):
+    """T transitions of B environments: T+1 rows, the last one only to bootstrap from."""
+
+    steps: ActorOutput  # each field [T+1, B, ...]
+    core_state: CoreState  # [B, L], enters row 0
+
+
+class FrameStatistics(NamedTuple):
+    """Running mean and deviation of the frames, one scalar each, not yet bias-corrected."""
+
+    mean: Float[Array, ""]
+    std: Float[Array, ""]
+    weight: Float[Array, ""]  # 1 - decay^count: what the corrected values are divided by
+
+
+class TrainState(NamedTuple):
+    """All that training changes and a checkpoint keeps."""
+
+    params: Params
+    opt_state: Any
+    statistics: FrameStatistics
+    updates: Int[Array, ""]  # minibatch updates so far, those skipped included
+    skipped: Int[Array, ""]  # updates skipped in a row because something was not finite

@@ -1,0 +1,310 @@
+"""experiments/ and the command line: what is composed, what is refused, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+import yaml
+
+from foajax.compose import compose, list_experiments, run
+from foajax.config import Config, ConfigError, HeadConfig, LogPolarSensor, RingSensor, to_mapping
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# Table II: window, values, peripheral. The peripheral adds at most its 16 outer cells of 25.
+TABLE_II = {
+    "nonfoa": ((80, 80), 6400, None),
+    "constant50_sub1": ((50, 50), 2500, None),
+    "constant50_sub2": ((50, 50), 625, None),
+    "constant70": ((70, 70), 1225, None),
+    "decreasing": ((70, 70), 1450, None),
+    "constant70_p": ((70, 70), 1241, (5, 5)),
+    "decreasing_p": ((70, 70), 1466, (5, 5)),
+}
+PACKED = [f"{name}_packed" for name in TABLE_II if name != "nonfoa"]
+
+
+def nominal_values(sensor):
+    """Pixel values as Table II counts them: each ring without the area that the rings inside it hide."""
+    if isinstance(sensor, LogPolarSensor):
+        return sensor.rings * sensor.wedges
+    total, hidden = 0.0, 0
+    for height, width, factor in sensor.rings:
+        total += (height * width - hidden) / factor**2
+        hidden = height * width
+    return total + (16 if sensor.peripheral else 0)
+
+
+@functools.cache
+def composed(*overrides):
+    """A config that several tests look at."""
+    return compose(overrides)
+
+
+def error(*overrides):
+    """The message with which `overrides` are refused."""
+    with pytest.raises(ConfigError) as caught:
+        compose(overrides)
+    assert len(str(caught.value).splitlines()) == 1
+    return str(caught.value)
+
+
+def key_paths(mapping, prefix=""):
+    for name, value in mapping.items():
+        yield prefix + name
+        if isinstance(value, dict):
+            yield from key_paths(value, f"{prefix}{name}.")
+
+
+def test_base_yaml_states_every_key_and_the_dataclasses_defaults():
+    defaults = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
+    assert composed() == defaults
+    stated = yaml.safe_load((ROOT / "experiments/base.yaml").read_text())
+    known = to_mapping(defaults)
+    for other, mapping in (("defaults", stated), ("hydra", stated), ("sensor", known)):
+        del mapping[other]
+    assert set(key_paths(stated)) == set(key_paths(known))
+
+
+@pytest.mark.parametrize(
+    ("name", "sensor"), [("rings", RingSensor(rings=((1, 1, 1),))), ("logpolar", LogPolarSensor())]
+)
+def test_a_sensor_kind_states_every_key_and_the_dataclass_default(name, sensor):
+    stated = yaml.safe_load((ROOT / f"experiments/sensor/{name}.yaml").read_text())
+    known = to_mapping(sensor)
+    if name == "rings":
+        assert stated["rings"] == "???"  # has no default
+        stated["rings"] = known["rings"]
+    assert stated == known
+
+
+def test_the_experiments_are_the_papers_their_packed_layouts_and_the_log_polar_one():
+    assert list_experiments() == sorted([*TABLE_II, *PACKED, "logpolar"])
+
+
+@pytest.mark.parametrize("name", list_experiments())
+def test_an_experiment_has_its_name_and_its_sensor(name):
+    config = composed(f"experiment={name}")
+    assert config.name == name
+    assert config.gaze.mode == ("none" if name == "nonfoa" else "learned")
+    if name == "logpolar":
+        assert nominal_values(config.sensor) == 1225 and config.gaze.bounds == "point"
+        return
+    window, values, peripheral = TABLE_II[name.removesuffix("_packed")]
+    assert config.sensor.window == window
+    assert nominal_values(config.sensor) == values
+    assert config.sensor.peripheral == peripheral
+    assert config.sensor.layout == ("packed" if name.endswith("_packed") else "canvas")
+    assert config.gaze.bounds == "window"
+
+
+@pytest.mark.parametrize("name", [*TABLE_II, *PACKED, "logpolar"])
+def test_a_sensor_can_be_swapped_alone(name):
+    config = compose([f"sensor={name}"])
+    assert config.sensor == composed(f"experiment={name}").sensor
+    assert config.name == "constant70"
+
+
+def test_a_sensor_can_be_ones_own():
+    sensor = compose(["sensor=rings", "sensor.rings=[[40,40,1],[60,60,3]]"]).sensor
+    assert sensor.rings == ((40, 40, 1), (60, 60, 3))
+    assert error("sensor=rings").startswith("sensor.rings: missing")
+
+
+@pytest.mark.parametrize("mode", ["none", "learned", "frozen", "random", "scripted"])
+def test_gaze_is_a_choice_and_has_values(mode):
+    gaze = compose([f"gaze={mode}", "gaze.step=8"]).gaze
+    assert (gaze.mode, gaze.step) == (mode, 8)
+
+
+def test_learner_paper_is_table_three():
+    config = compose(["learner=paper"])
+    learner, env = config.learner, config.env
+    assert (learner.rollout_length, learner.learning_rate, env.num_envs) == (20, 1e-4, 32)
+    assert learner.natural == learner.vision == HeadConfig(gamma=0.99, gae_lambda=0.92, beta=0.01)
+    assert (learner.adam_b1, learner.adam_b2, learner.adam_eps) == (0.9, 0.999, 1e-8)
+    assert (learner.max_grad_norm, learner.clip_ratio, learner.reduction) == (None, None, "sum")
+    assert (learner.value_weight, learner.vision_weight, learner.epochs) == (1.0, 1.0, 1)
+    assert learner.minibatches == 32
+    assert compose(["learner=paper", "env.num_envs=6"]).learner.minibatches == 6
+    assert env.frame_shape == (80, 80) and env.frame_skip == 4 and env.noop_max == 30
+    assert env.clip_rewards and env.episodic_life and env.fire_on_reset
+
+
+def test_network_choices():
+    assert (
+        compose(["network=a3c"]).network
+        == compose(["network.torso=a3c", "network.dense=0", "network.lstm=512"]).network
+    )
+    assert compose(["network=nature"]) == composed()
+
+
+def test_the_vision_head_follows_the_natural_head_until_it_is_set():
+    both = compose(["learner.natural.gamma=0.9"]).learner
+    assert both.natural.gamma == both.vision.gamma == 0.9
+    one = compose(["learner.natural.gamma=0.9", "learner.vision.gamma=0.5"]).learner
+    assert (one.natural.gamma, one.vision.gamma) == (0.9, 0.5)
+
+
+@pytest.mark.parametrize("game", ["pong", "seek", "gymnasium:CartPole-v1", "gymnasium:ALE/Pong-v5"])
+def test_game_is_a_plain_name(game):
+    assert compose([f"game={game}"]).game == game
+
+
+def test_a_mapping_takes_new_keys_and_a_later_word_wins():
+    assert compose(["env.crop_top.pong=30"]).env.crop_top == {"default": 34, "beam_rider": 20, "pong": 30}
+    assert compose(["seed=1", "experiment=nonfoa", "seed=2", "experiment=logpolar"]).seed == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "fragments"),
+    [
+        ("experiment=foo", ["experiment=foo: accepted is one of constant50_sub1, ", "nonfoa"]),
+        ("experiment=constnt70", ["experiment=constnt70", "(did you mean constant70?)"]),
+        ("experiment=a/b", ["experiment=a/b: accepted is one of"]),
+        ("experiment=", ["experiment=: accepted is one of"]),
+        ("gaze=null", ["gaze=null: accepted is one of frozen, learned, none, random, scripted"]),
+        ("gaze=[frozen]", ["gaze=[frozen]: accepted is one of"]),
+        ("gaze={mode: frozen}", ["gaze={mode: frozen}: accepted is one of"]),
+        ("learner.gama=0.9", ["learner.gama=0.9: unknown key; accepted are rollout_length, "]),
+        ("gama=0.9", ["gama=0.9: unknown key; accepted are name, "]),
+        ("foo/bar=1", ["foo/bar=1: unknown key"]),
+        ("game.speed=2", ["game={'speed': 2}: accepted is a string"]),
+        ("learner.natural=3", ["learner.", "natural", "accepted is"]),
+        ("seed=one", ["seed=one: accepted is an integer"]),
+        ("seed=1.5", ["seed=1.5: accepted is an integer"]),
+        ("learner.natural.gamma=1.5", ["learner.natural.gamma=1.5: accepted is a number in [0, 1]"]),
+        ("env.frame_shape=80", ["env.frame_shape=80: accepted is [an integer, an integer]"]),
+        ("sensor.rings.first=3", ["sensor.rings.first=3", "accepted is"]),
+        ("sensor.rings.9=3", ["sensor.rings.9=3", "accepted is"]),
+        ("experiment", ["experiment: accepted is key=value"]),
+        ("=3", ["=3: accepted is key=value"]),
+        ("game=[1", ["game=[1: accepted is key=value"]),
+        ("game='x", ["game='x: accepted is key=value"]),
+        ("game=a\nb", ["game=a b: accepted is key=value"]),
+        ("game=x=y", ["game=x=y: accepted is key=value"]),
+        ("~learner", ["~learner: accepted is key=value"]),
+        ("sensor@eye=constant70", ["sensor@eye=constant70: accepted is key=value"]),
+        ("game=pong,breakout", ["game=pong,breakout: accepted is one value", "--multirun"]),
+        ("seed=range(3)", ["seed=range(3): accepted is one value", "--multirun"]),
+        ("hydra.run.dir=x", ["hydra.run.dir=x: accepted only together with --multirun"]),
+        ("game=${nothing}", ["game: ", "'nothing'", "accepted is"]),
+        ("game=${oc.env:FOAJAX_NOT_SET}", ["game: ", "'FOAJAX_NOT_SET'", "accepted is"]),
+        ("game=${what:1}", ["game: ", "what", "accepted is"]),
+        ("learner.natural.gamma=${learner.vision.gamma}", ["learner.natural.gamma: ", "accepted is"]),
+    ],
+)
+def test_a_mistake_is_one_line_with_key_value_and_what_is_accepted(override, fragments):
+    message = error(override)
+    assert message.startswith(fragments[0])
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.fixture
+def cwd(tmp_path, monkeypatch):
+    """An empty working directory, far from the checkout."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def runs():
+    """A list of the configs that `record` was given, and `record`, which returns the seed as exit code."""
+
+    class Runs(list):
+        def record(self, config):
+            self.append(config)
+            if config.game == "brekout":
+                raise ConfigError("game=brekout: accepted is a game")
+            return config.seed
+
+    return Runs()
+
+
+def test_a_single_run_starts_directly_and_leaves_nothing_of_its_own(cwd, runs):
+    assert run(runs.record, ["experiment=nonfoa", "game=pong"]) == 0
+    assert [(config.name, config.game) for config in runs] == [("nonfoa", "pong")]
+    assert list(cwd.iterdir()) == []
+    assert run(runs.record, ["seed=3"]) == 3
+    assert run(lambda config: None, []) == 0
+
+
+@pytest.mark.parametrize(
+    "arguments", [["game=brekout"], ["seed=one"], ["--multirun", "seed=0,one"], ["--cfg", "job", "a=1"]]
+)
+def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(cwd, runs, capsys, arguments):
+    assert run(runs.record, arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("foajax: error: ") and len(err.splitlines()) == 1
+    assert list(cwd.iterdir()) == []
+
+
+def test_a_sweep_runs_every_combination_in_order(cwd, runs):
+    argv = list(sys.argv)
+    arguments = ["-m", "game=pong,seek", "experiment=glob(constant50_sub?)", "env.crop_top.pong=30"]
+    assert run(runs.record, arguments) == 0
+    assert [(config.game, config.name) for config in runs] == [
+        ("pong", "constant50_sub1"),
+        ("pong", "constant50_sub2"),
+        ("seek", "constant50_sub1"),
+        ("seek", "constant50_sub2"),
+    ]
+    assert all(config.env.crop_top["pong"] == 30 for config in runs)
+    assert [path.name for path in cwd.iterdir()] == ["sweeps"]
+    assert [path.name for path in cwd.glob("sweeps/*/*")] == ["multirun.yaml"]
+    assert sys.argv == argv
+
+
+def test_the_first_run_that_fails_ends_a_sweep(cwd, runs):
+    assert run(runs.record, ["--multirun", "seed=0,5,6"]) == 5
+    assert [config.seed for config in runs] == [0, 5]
+
+
+def test_runs_of_a_sweep_may_not_share_a_directory(cwd, runs, capsys):
+    assert run(runs.record, ["-m", "gaze=frozen,random"]) == 2
+    assert "two runs would share it" in capsys.readouterr().err
+    assert run(runs.record, ["-m", "gaze=frozen,random", "name=constant70-${gaze.mode}"]) == 0
+    assert [config.name for config in runs] == ["constant70-frozen", "constant70-random"]
+
+
+def test_help_lists_the_experiments_and_cfg_prints_the_run(cwd, runs, capsys):
+    assert run(runs.record, ["--help"]) == 0
+    assert f"experiment: {', '.join(list_experiments())}" in capsys.readouterr().out
+    assert run(runs.record, ["--cfg", "job", "seed=7"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["seed"] == 7
+    assert runs == [] and list(cwd.iterdir()) == []
+
+
+def test_composing_works_from_any_directory(cwd):
+    assert compose(["experiment=logpolar"]).name == "logpolar"
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_brings_the_experiments_along(tmp_path):
+    wheels = tmp_path / "wheels"
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", wheels, ROOT]
+    subprocess.run(build, check=True, cwd=tmp_path)
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv/bin/python"
+    subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", *wheels.iterdir()], check=True)
+    purelib = subprocess.run(
+        [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+        check=True, capture_output=True, text=True,
+    ).stdout.strip()  # fmt: skip
+    # The dependencies are big: those of this environment are lent to the fresh one.
+    Path(purelib, "lent.pth").write_text(sysconfig.get_path("purelib"))
+    code = "import foajax.compose as c; print(c.__file__, *c.list_experiments(), c.compose(['seed=7']).seed)"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    printed = subprocess.run(
+        [python, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path, env=environment
+    ).stdout.split()
+    assert Path(printed[0]).is_relative_to(tmp_path)
+    assert printed[1:] == [*list_experiments(), "7"]

@@ -1,0 +1,175 @@
+"""The update: what it learns where values are known, what it must leave alone, and one compilation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foajax import compose, learner
+from foajax.agent import Agent
+from foajax.optimizer import make_optimizer
+from foajax.programs import make_programs, make_state
+from foajax.rollout import Collector
+from foajax.train import make_environments
+
+SMALL = ["network.dense=32", "network.lstm=32", "env.num_envs=8", "learner.minibatches=2"]
+# A small full view: cheap, and it tells all that a probe shows.
+VIEW = ["sensor=rings", "sensor.rings=[[80,80,8]]", "sensor.layout=packed", "experiment=nonfoa"]
+
+
+class Loop:
+    """A run without its outside: environments, both programs, the state."""
+
+    def __init__(self, *overrides):
+        self.config = compose.compose([*SMALL, *overrides])
+        environments = make_environments(self.config, 0)
+        self.agent = Agent(self.config, environments[0].num_actions, environments[0].crop_top)
+        self.programs = make_programs(self.agent)
+        self.state = make_state(self.agent, self.config.seed)
+        self.collector = Collector(self.agent, self.programs, environments, seed=self.config.seed)
+        self.step = 0
+        self.metrics = []
+
+    def collect(self):
+        rollouts, outcomes = self.collector.collect(self.state, self.step)
+        self.step += self.config.learner.rollout_length
+        return rollouts, outcomes
+
+    def run(self, count):
+        """`count` rollouts with their updates; the mean score a step of the last tenth."""
+        scores = []
+        for _ in range(count):
+            rollouts, outcomes = self.collect()
+            for epoch in range(self.config.learner.epochs):
+                for rollout in rollouts:
+                    for index in range(self.config.learner.minibatches // len(rollouts)):
+                        self.state, row = self.programs.update(
+                            self.state, rollout, np.int32(index), np.bool_(epoch == 0)
+                        )
+                        self.metrics.append(row)
+            scores.append(np.mean([outcome.score for group in outcomes for outcome in group]))
+        return np.mean(scores[-max(1, count // 10) :])
+
+
+@pytest.fixture(scope="module")
+def seek():
+    """Both heads on the pure-JAX game, a few updates in."""
+    loop = Loop("game=seek", "experiment=constant50_sub2_packed")
+    loop.run(3)
+    return loop
+
+
+def total_loss(loop, params, rollout):
+    return learner.loss(params, loop.agent, rollout)[0]
+
+
+def test_act_and_update_compile_once(seek):
+    seek.run(2)
+    assert seek.programs.act._cache_size() == 1
+    assert seek.programs.update._cache_size() == 1
+
+
+def test_every_parameter_of_both_heads_gets_a_gradient(seek):
+    (rollout,), _ = seek.collect()
+    gradient = jax.grad(lambda params: total_loss(seek, params, rollout))(seek.state.params)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        assert np.any(leaf != 0), jax.tree_util.keystr(path)
+
+
+def test_the_loss_is_the_sum_of_its_weighted_terms(seek):
+    (rollout,), _ = seek.collect()
+    total, metrics = learner.loss(seek.state.params, seek.agent, rollout)
+    config = seek.config.learner
+    expected = sum(
+        weight
+        * (
+            metrics[f"{head}_policy_loss"]
+            - getattr(config, head).beta * metrics[f"{head}_entropy"]
+            + config.value_weight * metrics[f"{head}_value_loss"]
+        )
+        for head, weight in (("natural", 1.0), ("vision", config.vision_weight))
+    )
+    np.testing.assert_allclose(total, expected, rtol=1e-5)
+
+
+def test_the_last_row_is_only_bootstrapped_from(seek):
+    """Changing what the last row chose, or its vision value's target, changes nothing but the bootstrap."""
+    (rollout,), _ = seek.collect()
+    steps = rollout.steps
+    other = steps._replace(
+        natural_action=steps.natural_action.at[-1].add(1) % 2,
+        vision_action=steps.vision_action.at[-1].add(1) % 5,
+        natural_log_prob=steps.natural_log_prob.at[-1].set(-9.0),
+    )
+    same = total_loss(seek, seek.state.params, rollout._replace(steps=other))
+    np.testing.assert_array_equal(same, total_loss(seek, seek.state.params, rollout))
+
+
+def test_ignored_actions_do_not_matter(seek):
+    """The step after an episode's end ignores its action: neither it nor its reward may enter the loss."""
+    (rollout,), _ = seek.collect()
+    steps = rollout.steps
+    is_terminal = steps.is_terminal.at[7, 3].set(True)
+    is_first = steps.is_first.at[8, 3].set(True)
+    steps = steps._replace(is_terminal=is_terminal, is_first=is_first)
+    changed = steps._replace(
+        natural_action=steps.natural_action.at[7, 3].set(1 - steps.natural_action[7, 3]),
+        vision_action=steps.vision_action.at[7, 3].set((steps.vision_action[7, 3] + 1) % 5),
+        reward=steps.reward.at[8, 3].set(100.0),
+    )
+    before, after = (total_loss(seek, seek.state.params, rollout._replace(steps=s)) for s in (steps, changed))
+    np.testing.assert_array_equal(before, after)
+
+
+def test_a_minibatch_is_its_own_environments(seek):
+    (rollout,), _ = seek.collect()
+    part = learner.minibatch(rollout, jnp.int32(1), 4)
+    np.testing.assert_array_equal(part.steps.reward, rollout.steps.reward[:, 4:])
+    np.testing.assert_array_equal(part.core_state.hidden, rollout.core_state.hidden[4:])
+
+
+@pytest.mark.parametrize("where", ["reward", "parameter"])
+def test_what_is_not_finite_is_skipped_and_counted(seek, where):
+    (rollout,), _ = seek.collect()
+    config = seek.config
+    update = jax.jit(
+        lambda state, rollout: learner.update(
+            seek.agent, make_optimizer(config.learner, 10), 4, state, rollout, jnp.int32(0), jnp.bool_(True)
+        )
+    )
+    state = seek.state
+    if where == "reward":
+        rollout = rollout._replace(steps=rollout.steps._replace(reward=rollout.steps.reward.at[3, 1].set(jnp.nan)))
+    else:
+        state = state._replace(params=jax.tree.map(lambda x: x.at[(0,) * x.ndim].set(jnp.inf), state.params))
+    after, metrics = update(state, rollout)
+    jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (state.params, state.opt_state))
+    assert metrics["skipped"] == 1 and after.skipped == state.skipped + 1
+    again, _ = update(after, rollout)
+    assert again.skipped == state.skipped + 2
+    (good,), _ = seek.collect()
+    if where == "reward":
+        assert update(again, good)[0].skipped == 0
+
+
+def test_frames_are_counted_once_however_many_passes():
+    one, two = Loop("game=seek", *VIEW), Loop("game=seek", *VIEW, "learner.epochs=2", "learner.clip_ratio=0.2")
+    one.run(1), two.run(1)
+    np.testing.assert_allclose(one.state.statistics.weight, two.state.statistics.weight, rtol=1e-6)
+    assert two.state.updates == 2 * one.state.updates
+
+
+def test_two_groups_see_what_each_would_alone():
+    """Groups only interleave: the first of two, with the whole batch's parameters, acts as it would by itself."""
+    loops = [Loop("game=seek", *VIEW, f"env.groups={groups}") for groups in (1, 2)]
+    shapes = [[r.steps.reward.shape for r in loop.collect()[0]] for loop in loops]
+    assert shapes == [[(21, 8)], [(21, 4), (21, 4)]]
+
+
+def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
+    runs = [Loop("game=seek", *VIEW, f"seed={seed}") for seed in (0, 0, 1)]
+    for loop in runs:
+        loop.run(3)
+    first, second, other = (jax.tree.leaves(loop.state.params) for loop in runs)
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))

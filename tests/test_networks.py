@@ -1,0 +1,83 @@
+"""Shapes of both torsos for every sensor, one state for whole and split unrolls, the heads' presence."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foajax import compose
+from foajax.networks import initial_core_state, initial_params, make_network
+
+EXPERIMENTS = compose.list_experiments()
+
+
+def build(*overrides):
+    config = compose.compose(overrides)
+    network = make_network(config, 4)
+    return config, network, initial_params(network, jax.random.key(0), config)
+
+
+def inputs(config, steps, batch):
+    from foajax.foveation import image_shapes
+
+    rng = np.random.default_rng(0)
+    shapes = image_shapes(config.sensor, config.env.frame_shape)
+    roi = [jnp.asarray(rng.normal(size=(steps, batch, *shape)), jnp.float32) for shape in shapes]
+    focal_point = jnp.asarray(rng.uniform(-1, 1, (steps, batch, 2)), jnp.float32)
+    is_first = np.zeros((steps, batch), bool)
+    is_first[2, 1] = True
+    return roi, focal_point, jnp.asarray(is_first)
+
+
+@pytest.mark.parametrize("torso", ["nature", "a3c"])
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_has_four_outputs_or_two(experiment, torso):
+    config, network, params = build(f"experiment={experiment}", f"network={torso}")
+    roi, focal_point, is_first = inputs(config, 3, 2)
+    output, _ = jax.eval_shape(network.apply, params, roi, focal_point, is_first, initial_core_state(network, 2))
+    assert output.natural_logits.shape == (3, 2, 4) and output.natural_value.shape == (3, 2)
+    if config.gaze.learned:
+        assert output.vision_logits.shape == (3, 2, config.gaze.actions) and output.vision_value.shape == (3, 2)
+    else:
+        assert output.vision_logits is None and output.vision_value is None
+
+
+def test_only_a_canvas_tells_its_place_by_itself():
+    for experiment, sees in (("constant70", False), ("nonfoa", False), ("constant70_packed", True), ("logpolar", True)):
+        assert build(f"experiment={experiment}")[1].sees_focal_point == sees
+
+
+def test_a_split_unroll_is_the_whole():
+    config, network, params = build("experiment=constant50_sub2_packed")
+    roi, focal_point, is_first = inputs(config, 6, 2)
+    state = initial_core_state(network, 2)
+    whole, last = network.apply(params, roi, focal_point, is_first, state)
+    first, middle = network.apply(params, [x[:3] for x in roi], focal_point[:3], is_first[:3], state)
+    second, end = network.apply(params, [x[3:] for x in roi], focal_point[3:], is_first[3:], middle)
+    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), joined, whole)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), end, last)
+
+
+def test_environments_do_not_mix_and_episodes_do_not_leak():
+    config, network, params = build("experiment=constant50_sub2_packed")
+    roi, focal_point, is_first = inputs(config, 5, 2)
+    state = initial_core_state(network, 2)
+
+    def value(image, t, b):
+        output, _ = network.apply(params, [image], focal_point, is_first, state)
+        return output.natural_value[t, b] + output.vision_value[t, b]
+
+    reached = np.any(jax.grad(value)(roi[0], 4, 1) != 0, axis=(2, 3, 4))
+    # Environment 1 starts an episode at step 2: steps 2..4 matter, nothing before and nobody else.
+    np.testing.assert_array_equal(reached[:, 1], [False, False, True, True, True])
+    assert not reached[:, 0].any()
+
+
+def test_the_initial_policies_are_about_uniform():
+    config, network, params = build("experiment=constant70")
+    roi, focal_point, is_first = inputs(config, 3, 2)
+    output, _ = network.apply(params, roi, focal_point, is_first, initial_core_state(network, 2))
+    for logits in (output.natural_logits, output.vision_logits):
+        probabilities = jax.nn.softmax(logits)
+        np.testing.assert_allclose(probabilities, 1 / logits.shape[-1], atol=0.02)
