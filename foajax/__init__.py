@@ -6,18 +6,21 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["Agent", "Config", "ConfigError", "load_agent", "sense"]
+__all__ = ["Agent", "Config", "ConfigError", "FoveatedObservation", "FoveatedVectorObservation", "load_agent", "sense"]
 
 if TYPE_CHECKING:
     from foajax.agent import Agent
     from foajax.config import Config, ConfigError
     from foajax.foveation import sense
     from foajax.store import load_agent
+    from foajax.wrapper import FoveatedObservation, FoveatedVectorObservation
 else:
     _HOMES = {
         "Agent": "agent",
         "Config": "config",
         "ConfigError": "config",
+        "FoveatedObservation": "wrapper",
+        "FoveatedVectorObservation": "wrapper",
         "load_agent": "store",
         "sense": "foveation",
     }

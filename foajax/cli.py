@@ -5,16 +5,13 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import yaml
 
 from foajax.config import ConfigError, build
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Options = TypeVar("Options", bound="DataclassInstance")
+Options = TypeVar("Options")
 
 
 def parse(options: type[Options], arguments: Sequence[str]) -> Options:
@@ -23,9 +20,8 @@ def parse(options: type[Options], arguments: Sequence[str]) -> Options:
     for word in arguments:
         key, separator, text = word.partition("=")
         if not separator:
-            raise ConfigError(
-                f"{word}: accepted is key=value with one of {', '.join(f.name for f in dataclasses.fields(options))}"
-            )
+            names = ", ".join(field.name for field in dataclasses.fields(cast(Any, options)))
+            raise ConfigError(f"{word}: accepted is key=value with one of {names}")
         try:
             values[key] = yaml.safe_load(text) if text else None
         except yaml.YAMLError:

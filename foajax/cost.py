@@ -21,11 +21,10 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from rich import box
@@ -103,7 +102,7 @@ def decide(
     """The network's part: torso to sampling, and the gaze's move."""
     batch = focal_point.shape[0]
     natural_key, vision_key = jax.random.split(key)
-    output, core_state = agent.network.apply(
+    output, state = agent.network.apply(
         params,
         [image[None] for image in roi],
         agent.unit(focal_point)[None],
@@ -114,7 +113,7 @@ def decide(
     natural_action = jax.random.categorical(natural_key, output.natural_logits)
     vision_action, _ = agent.choose_vision(vision_key, output, False)
     age = jnp.zeros(batch, jnp.int32)
-    return natural_action, agent.move(focal_point, vision_action, age), core_state
+    return natural_action, agent.move(focal_point, vision_action, age), cast(CoreState, state)
 
 
 def decision(
@@ -131,14 +130,15 @@ def decision(
 
 def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ 1"], ...]) -> list[Array]:
     """The convolutions alone, of every image that is large enough for them."""
-    module = {"nature": networks.NatureTorso, "a3c": networks.A3CTorso}[agent.config.network.torso]()
-    own = [params["params"].get(f"torso_{i}") for i in range(len(roi))]
-    return [module.apply({"params": p}, image) for p, image in zip(own, roi, strict=True) if p is not None]
+    module: Any = networks.TORSOS[agent.config.network.torso]()
+    weights = {i: params["params"].get(f"torso_{i}") for i in range(len(roi))}
+    return [module.apply({"params": own}, roi[i]) for i, own in weights.items() if own is not None]
 
 
 def flops(function: Callable[..., Any], *arguments: Any) -> int:
     """Floating-point operations of a call, as XLA counts them before it compiles."""
-    return int(jax.jit(function).lower(*arguments).cost_analysis()["flops"])
+    analysis: Any = jax.jit(function).lower(*arguments).cost_analysis()
+    return int(analysis["flops"])
 
 
 def _subject(config: Config) -> Subject:
@@ -244,7 +244,7 @@ def _print(records: Sequence[dict[str, Any]]) -> None:
     console = Console(width=150, highlight=False)
     console.print(table)
     device = f"{jax.devices()[0].device_kind}, host {platform.machine()} with {os.cpu_count()} cores"
-    console.print(f"Ratios are to {_REFERENCE}. {device}, jax {jax.__version__}, jaxlib {jaxlib.__version__}.")
+    console.print(f"Ratios are to {_REFERENCE}. {device}, jax {jax.__version__}.")
 
 
 if __name__ == "__main__":

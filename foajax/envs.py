@@ -1,122 +1,269 @@
-"""Environments of every engine behind one interface: EnvPool's Atari, ale-py's, Gymnasium's, and our own in JAX.
+"""The host's interface to environments, and the two Atari engines behind it.
 
-All of them show an episode's end the same way (*next-step* auto-reset): the step that ends an episode gives its last
-frame, the step after it ignores its action and gives the next episode's first frame, with `is_first` and reward 0.
-A lost life ends the learner's episode (`is_terminal`) where `env.episodic_life`, the game goes on. A step limit ends
-an episode without a terminal: something would have followed.
+All engines show an episode's end the same way (*next-step* auto-reset): the step that ends an episode gives its last
+frame; the step after it ignores its action and gives the next episode's first frame, with `is_first` and reward 0.
+
+For the learner an episode ends as a terminal when the game is over or, with `env.episodic_life`, when a life is
+lost; then the game goes on in the learner's next episode. At the step limit it ends without a terminal.
+
+The Atari engines play the same games, not the same way. Where an episode begins, EnvPool makes its 0 to
+`env.noop_max` no-ops and then one more action, FIRE where the game has it (a no-op where not, or where
+`env.fire_on_reset` is off); ale-py makes FIRE first and counts it among the no-ops. After a lost life EnvPool begins
+with no-ops and FIRE again, ale-py with FIRE alone. Neither can be saved: a resumed run starts new games.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable, Iterable
 from typing import Protocol, runtime_checkable
 
-import envpool
 import numpy as np
 
-from foajax import jax_envs, seek
-from foajax.config import Config, ConfigError, EnvConfig
+from foajax import probes, seek
+from foajax.config import Config, ConfigError
+from foajax.gymnasium_env import GymnasiumEnvironment
+from foajax.jax_envs import JaxEnvironment, Task
 from foajax.types import Outcome, TimeStep
 
-SCREEN = (210, 160)  # rows, columns of the Atari 2600
+SCREEN_SHAPE = (210, 160)  # rows and columns of an Atari screen
+FRAME_SHAPE = (80, 80)  # of what `frames.crop_and_halve` makes of it
+
+OWN: dict[str, Callable[[tuple[int, int]], Task]] = {
+    "seek": seek.task,
+    **{f"probe:{name}": task for name, task in probes.PROBES.items()},
+}
 
 
 @runtime_checkable
 class Environment(Protocol):
-    """A batch of equal environments, stepped together by the host. Arrays handed out stay as they are."""
+    """A batch of equal environments, stepped together by the host.
 
-    num_envs: int
+    Arrays handed out are NumPy's, in the environments' order, and never written to again.
+    """
+
+    num_envs: int  # B
     num_actions: int
-    screen_shape: tuple[int, ...]  # of a frame without the batch
+    screen_shape: tuple[int, ...]  # of `TimeStep.frame` without the batch
     crop_top: int | None  # first of the 160 screen rows kept; None where the screen is the frame
 
     def reset(self) -> tuple[TimeStep, Outcome]:
-        """Begins all episodes; once, before the first step."""
+        """Begins all episodes; once, before the first `send`."""
 
     def send(self, action: np.ndarray) -> None:
-        """Starts a step with natural actions, int32 [B], and returns."""
+        """Starts a step with the natural actions, int32 [B], and does not wait for it."""
 
     def recv(self) -> tuple[TimeStep, Outcome]:
-        """The step that `send` started, once all environments are through; NumPy arrays."""
+        """The step that `send` started, once every environment is through."""
+
+    def render(self) -> np.ndarray:
+        """The screens in colour, uint8 [B, h, w, 3]; of an environment made with `render`."""
 
     def close(self) -> None:
-        """Ends the engine."""
+        """Ends the engine's threads."""
 
 
-def make(config: Config, *, num_envs: int, seed: int) -> Environment:
-    """The environment of `config.game`; ConfigError where there is none of that name."""
-    game = config.game
-    if game == "seek":
-        return jax_envs.JaxEnvironment(seek.task(config.env.frame_shape), num_envs=num_envs, seed=seed)
-    return EnvPoolAtari(game, config.env, num_envs=num_envs, seed=seed)
+def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> Environment:
+    """The environment that plays `config.game`: an Atari game, `seek`, `probe:<name>` or `gymnasium:<id>`.
+
+    Args:
+      config: `game` and `env` are read.
+      num_envs: how many environments step together.
+      seed: environment i of the Atari engines and of Gymnasium is seeded with `seed + i`.
+      render: whether `Environment.render` will be called.
+
+    Raises:
+      ConfigError: if there is no such game, or the engine cannot do what `env` asks.
+    """
+    if config.game in OWN:
+        return JaxEnvironment(OWN[config.game](config.env.frame_shape), num_envs=num_envs, seed=seed)
+    if config.game.startswith("gymnasium:"):
+        return GymnasiumEnvironment(config, num_envs=num_envs, seed=seed, render=render)
+    engine = EnvPoolEnvironment if config.env.engine == "envpool" else AleEnvironment
+    return engine(config, num_envs=num_envs, seed=seed, render=render)
 
 
-class EnvPoolAtari(Environment):
-    """EnvPool's Atari: env i is seeded with `seed + i`; its reset ignores seeds."""
+class EnvPoolEnvironment:
+    """An Atari game of EnvPool, which steps in its own threads. `recv` hands out EnvPool's arrays, not copies."""
 
-    def __init__(self, game: str, env: EnvConfig, *, num_envs: int, seed: int) -> None:
+    crop_top: int | None
+    screen_shape: tuple[int, ...] = SCREEN_SHAPE
+    _lives: np.ndarray  # after the last step
+    _ended: np.ndarray  # whether the last step ended an episode
+    _over: np.ndarray  # whether it ended a game
+
+    def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
+        import envpool  # here, because importing it takes seconds that other engines need not spend
+        from envpool.atari.registration import atari_game_list
+
+        game, env = atari_name(config.game, atari_game_list), config.env
+        self.crop_top = _crop_top(config, game, atari_game_list)
         self._pool = envpool.make(
-            _task_id(game),
+            envpool_id(game),
             env_type="gymnasium",
             num_envs=num_envs,
             num_threads=env.threads,
             seed=seed,
+            render_mode="rgb_array" if render else None,
             stack_num=1,
             gray_scale=True,
-            img_height=SCREEN[0],
-            img_width=SCREEN[1],
+            img_height=SCREEN_SHAPE[0],
+            img_width=SCREEN_SHAPE[1],
             frame_skip=env.frame_skip,
-            # EnvPool draws the number of no-ops from [0, noop_max - 1] and crashes where that is empty.
-            noop_max=env.noop_max + 1,
+            noop_max=env.noop_max + 1,  # EnvPool's no-ops are drawn from [0, noop_max - 1]; 0 crashes it
+            episodic_life=env.episodic_life,
             use_fire_reset=env.fire_on_reset,
             reward_clip=env.clip_rewards,
-            episodic_life=env.episodic_life,
             repeat_action_probability=env.sticky_actions,
             max_episode_steps=env.max_episode_steps,
         )
-        self.num_envs = num_envs
-        self.num_actions = int(self._pool.action_space.n)
-        self.screen_shape = SCREEN
-        self.crop_top = env.crop_top.get(game, env.crop_top["default"])
-        self._ids = np.arange(num_envs, dtype=np.int32)
-        self._ended = np.zeros(num_envs, bool)
+        self.num_envs, self.num_actions = num_envs, int(self._pool.action_space.n)
+        self._episodic_life = env.episodic_life
 
     def reset(self) -> tuple[TimeStep, Outcome]:
-        """Begins all games."""
-        screen, _ = self._pool.reset()
-        zeros, ones = np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, bool)
-        return TimeStep(screen[:, 0], zeros, ones, ~ones), Outcome(score=zeros, is_over=~ones)
+        """Begins all games. A second call would go on with the games, at the next life."""
+        screen, info = self._pool.reset()
+        self._lives = info["lives"]
+        self._ended = self._over = np.zeros(self.num_envs, bool)
+        return _first_step(screen[:, 0])
 
     def send(self, action: np.ndarray) -> None:
         """Starts a step in EnvPool's threads."""
-        self._pool.send(np.asarray(action, np.int32), self._ids)
+        self._pool.send(action)
 
     def recv(self) -> tuple[TimeStep, Outcome]:
-        """All environments' step, in their own order whatever order they finished in."""
+        """The step, as EnvPool tells it.
+
+        EnvPool flags the step limit alone where it falls together with a lost life or the game's end, and does not
+        tell of a game that ends during the no-ops after a lost life, except by the lives of the new one: then
+        `is_over` comes with that new episode's first step.
+        """
         screen, reward, terminated, truncated, info = self._pool.recv()
-        order = np.argsort(info["env_id"], kind="stable")
-        terminated, truncated = terminated[order], truncated[order]
+        lives, game_over = info["lives"], info["terminated"] == 1
+        lost = self._episodic_life & (lives > 0) & (lives < self._lives)
+        restarted = self._ended & ~self._over & (lives > self._lives)
+        is_over = game_over | truncated | restarted
         timestep = TimeStep(
-            frame=screen[order, 0],
-            reward=reward[order].astype(np.float32),
+            frame=screen[:, 0],
+            reward=reward,
             is_first=self._ended,
-            is_terminal=terminated,
+            is_terminal=terminated | (truncated & (game_over | lost)),
         )
-        self._ended = terminated | truncated
-        is_over = info["terminated"][order].astype(bool) | truncated
-        return timestep, Outcome(score=info["reward"][order], is_over=is_over & ~timestep.is_first)
+        self._lives, self._ended, self._over = lives, terminated | truncated, is_over
+        return timestep, Outcome(score=info["reward"], is_over=is_over)
+
+    def render(self) -> np.ndarray:
+        """The emulators' screens now, uint8 [B, 210, 160, 3]; `recv` shows the brighter of the last two."""
+        return np.asarray(self._pool.render(np.arange(self.num_envs)))
 
     def close(self) -> None:
-        """Ends EnvPool's threads."""
+        """Drops the pool, whose threads end with it."""
         self._pool.close()
+        del self._pool
 
 
-def _task_id(game: str) -> str:
-    """EnvPool's name of a game in snake case, or of one that is EnvPool's already."""
-    known = {task for task in envpool.list_all_envs() if task.endswith("-v5")}
-    task = game if game in known else "".join(word.capitalize() for word in game.split("_")) + "-v5"
-    if task not in known:
-        near = difflib.get_close_matches(task, known, n=3)
-        hint = f" (near: {', '.join(near)})" if near else ""
-        raise ConfigError(f"game={game}: accepted is an Atari game in snake case, seek or gymnasium:<id>{hint}")
-    return task
+class AleEnvironment:
+    """An Atari game of ale-py's own vector environment, which steps in its own threads."""
+
+    crop_top: int | None
+    screen_shape: tuple[int, ...] = SCREEN_SHAPE
+    _lives: np.ndarray  # after the last step
+    _ended: np.ndarray  # whether the last step ended an episode
+    _over: np.ndarray  # whether it ended a game
+
+    def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
+        from ale_py import Action, roms  # here, like EnvPool
+        from ale_py.vector_env import AtariVectorEnv
+
+        if render:
+            raise ConfigError("env.engine=ale: accepted is envpool where screens are to be rendered in colour")
+        game, env = atari_name(config.game, roms.get_all_rom_ids()), config.env
+        self.crop_top = _crop_top(config, game, roms.get_all_rom_ids())
+        self._env = AtariVectorEnv(
+            game,
+            num_envs,
+            num_threads=env.threads,
+            max_num_frames_per_episode=env.max_episode_steps * env.frame_skip,
+            repeat_action_probability=env.sticky_actions,
+            img_height=SCREEN_SHAPE[0],
+            img_width=SCREEN_SHAPE[1],
+            stack_num=1,
+            frameskip=env.frame_skip,
+            noop_max=env.noop_max + 1,
+            # Its own episodic_life would begin a new game at a lost life; this one only flags it.
+            life_loss_info=env.episodic_life,
+            reward_clipping=False,
+            use_fire_reset=env.fire_on_reset,
+        )
+        actions = list(self._env.ale.get_action_set())
+        fire = env.fire_on_reset and Action.FIRE in actions
+        self._restart = np.int32(actions.index(Action.FIRE) if fire else 0)
+        self.num_envs, self.num_actions = num_envs, len(actions)
+        self._seed, self._clip, self._max_steps = seed, env.clip_rewards, env.max_episode_steps
+
+    def reset(self) -> tuple[TimeStep, Outcome]:
+        """Begins all games, from the seed."""
+        screen, info = self._env.reset(seed=self._seed)
+        self._lives, self._steps = info["lives"], np.zeros(self.num_envs, int)
+        self._ended = self._over = np.zeros(self.num_envs, bool)
+        return _first_step(screen[:, 0])
+
+    def send(self, action: np.ndarray) -> None:
+        """Starts a step. After a lost life ale-py would take the action: it gets FIRE instead."""
+        self._env.send(np.where(self._ended, self._restart, action).astype(np.int32))
+
+    def recv(self) -> tuple[TimeStep, Outcome]:
+        """The step; points made by the FIRE after a lost life count in the score alone."""
+        screen, points, terminated, truncated, info = self._env.recv()
+        lives, score = info["lives"], points.astype(np.float32)
+        lost = terminated & (lives > 0) & (lives < self._lives)
+        # ale-py does not flag a step limit that falls together with a lost life.
+        self._steps = np.where(self._over, 0, self._steps + 1)
+        is_over = (terminated & ~lost) | (self._steps >= self._max_steps)
+        reward = np.where(self._ended, np.float32(0), np.sign(score) if self._clip else score)
+        timestep = TimeStep(frame=screen[:, 0], reward=reward, is_first=self._ended, is_terminal=terminated)
+        self._lives, self._ended, self._over = lives, terminated | truncated, is_over
+        return timestep, Outcome(score=score, is_over=is_over)
+
+    def render(self) -> np.ndarray:
+        """Not offered: ale-py's vector environment keeps gray screens only."""
+        raise NotImplementedError("env.engine=ale does not render")
+
+    def close(self) -> None:
+        """Drops the engine, whose threads end with it."""
+        del self._env
+
+
+def atari_name(game: str, known: Iterable[str]) -> str:
+    """The snake-case name, e.g. beam_rider, of a game given by that name or as EnvPool's BeamRider-v5.
+
+    Raises:
+      ConfigError: if `known` does not have it; the message has the nearest names.
+    """
+    names = {form: name for name in known for form in (name, envpool_id(name))}
+    if game in names:
+        return names[game]
+    near = difflib.get_close_matches(game.lower(), [*names, *OWN], n=3)
+    hint = f"; near: {', '.join(near)}" if near else ""
+    raise ConfigError(f"game={game}: accepted is an Atari game (breakout), {', '.join(OWN)} or gymnasium:<id>{hint}")
+
+
+def envpool_id(name: str) -> str:
+    """EnvPool's id of a snake-case name: BeamRider-v5 of beam_rider."""
+    return "".join(part.capitalize() for part in name.split("_")) + "-v5"
+
+
+def _crop_top(config: Config, game: str, known: Iterable[str]) -> int:
+    env = config.env
+    if env.frame_shape != FRAME_SHAPE:
+        shape = list(env.frame_shape)
+        raise ConfigError(f"env.frame_shape={shape}: accepted is {list(FRAME_SHAPE)} for game={config.game}")
+    for key, row in env.crop_top.items():
+        if key not in known and key != "default":
+            raise ConfigError(f"env.crop_top.{key}={row}: accepted is default or an Atari game in snake case")
+    return env.crop_top.get(game, env.crop_top["default"])
+
+
+def _first_step(screen: np.ndarray) -> tuple[TimeStep, Outcome]:
+    zeros, false = np.zeros(len(screen), np.float32), np.zeros(len(screen), bool)
+    return TimeStep(screen, zeros, is_first=~false, is_terminal=false), Outcome(score=zeros, is_over=false)

@@ -139,6 +139,7 @@ def _sense_gray(
     parts = _look(frame, corner, sensor)
     if isinstance(sensor, LogPolarSensor):
         return parts
+    parts = _means(parts, sensor)
     height, width = frame.shape
     cells = None if sensor.peripheral is None else _sense_cells(frame, sensor)
     if sensor.layout == "canvas":
@@ -165,45 +166,35 @@ def _picture_gray(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _look(frame: Num[Array, "H W"], corner: Int[Array, "2"], sensor: Sensor) -> tuple[Float[Array, "_ _"], ...]:
-    """The focal area with its top-left pixel at `corner`, pooled ring by ring, nothing hidden yet."""
-    parts = _pool(_window(frame, corner, sensor.window), sensor)
-    if isinstance(sensor, LogPolarSensor) or sensor.layout == "packed":
-        return parts
-    # Left alone, XLA pools a block anew for each of its pixels on the canvas (it drops optimisation
-    # barriers before it fuses). A loop that never turns makes it pool once: twice as fast.
-    never = corner[0] == np.iinfo(corner.dtype).min
-    _, parts = lax.while_loop(lambda state: state[0], lambda state: jax.tree.map(jnp.zeros_like, state), (never, parts))
-    return parts
+    """The focal area with its top-left pixel at `corner`, summed up part by part (see `_sums`).
+
+    A slice, moved inside the frame, and a second look with care if it had to be moved. That look is
+    a loop of no or one turn, not a `lax.cond`: under vmap a cond runs both branches for all frames,
+    a loop runs only if some area in the batch overhangs. Where none does, this is many times faster.
+    """
+    size = sensor.window
+    if any(length > limit for length, limit in zip(size, frame.shape, strict=True)):
+        return _sums(_gather_window(frame, corner, size), sensor)
+    start = jnp.clip(corner, 0, np.array(frame.shape) - size)
+
+    def look_again(state):
+        # What does not depend on the state would be moved out of the loop, and always run.
+        window = _apart(_gather_window(frame, start + state[0], size), corner)
+        return jnp.zeros_like(state[0]), _sums(window, sensor)
+
+    sums = _sums(lax.dynamic_slice(frame, start, size), sensor)
+    return lax.while_loop(lambda state: jnp.any(state[0] != 0), look_again, (corner - start, sums))[1]
 
 
 @_look.defjvp
 def _look_jvp(sensor, primals, tangents):
-    # Linear in the frame. The loops below are for speed, and cannot be transposed.
+    # Linear in the frame; the loops are for speed, and cannot be transposed.
     frame, corner = primals
-    return _look(frame, corner, sensor), _pool(_gather_window(tangents[0], corner, sensor.window), sensor)
-
-
-def _window(image: Num[Array, "H W"], corner: Int[Array, "2"], size: Shape) -> Num[Array, "h w"]:
-    """Cuts an area of `size` out of an image, 0 where it overhangs.
-
-    A slice that is moved inside the image, then put right if it was moved. That step is a loop of
-    no or one turn, not a `lax.cond`: under vmap a cond always runs both branches, while a loop runs
-    only if some area of the batch overhangs. Where none does, this is several times faster.
-    """
-    if any(length > limit for length, limit in zip(size, image.shape, strict=True)):
-        return _gather_window(image, corner, size)
-    start = jnp.clip(corner, 0, np.array(image.shape) - size)
-    window = lax.dynamic_slice(image, start, size)
-    _, window = lax.while_loop(
-        lambda state: jnp.any(state[0] != 0),
-        lambda state: (jnp.zeros_like(state[0]), _gather_window(state[1], state[0], size)),
-        (corner - start, window),
-    )
-    return window
+    return _look(frame, corner, sensor), _sums(_gather_window(tangents[0], corner, sensor.window), sensor)
 
 
 def _gather_window(image: Num[Array, "H W"], corner: Int[Array, "2"], size: Shape) -> Num[Array, "h w"]:
-    """`_window`, pixel by pixel."""
+    """Cuts an area of `size` with its top-left pixel at `corner` out of an image, 0 where it overhangs."""
     height, width = image.shape
     rows, columns = (first + jnp.arange(length) for first, length in zip(corner, size, strict=True))
     inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))[None]
@@ -211,30 +202,47 @@ def _gather_window(image: Num[Array, "H W"], corner: Int[Array, "2"], size: Shap
     return jnp.where(inside, image.reshape(-1).at[index].get(mode="promise_in_bounds"), 0)
 
 
+def _apart(window: Num[Array, "h w"], corner: Int[Array, "2"]) -> Num[Array, "h w"]:
+    """The same window, worked out before it is used.
+
+    Fused into what uses it, a gather is three times slower, and XLA drops optimisation barriers
+    before it fuses. A loop that never turns keeps them apart.
+    """
+    never = corner[0] == np.iinfo(corner.dtype).min
+    return lax.while_loop(lambda state: state[0], lambda state: jax.tree.map(jnp.zeros_like, state), (never, window))[1]
+
+
 def _place(image: Float[Array, "h w"], corner: Int[Array, "2"], frame_shape: Shape) -> Float[Array, "H W"]:
-    """Puts an image into an empty frame: the inverse of `_window`."""
+    """Puts an image into an empty frame: the inverse of `_gather_window`."""
     # XLA reads through the padding and never lays it out.
     padded = jnp.pad(image, [(size, size) for size in frame_shape])
     return lax.dynamic_slice(padded, np.array(frame_shape) - corner, frame_shape)
 
 
-def _pool(window: Num[Array, "h w"], sensor: Sensor) -> tuple[Float[Array, "_ _"], ...]:
-    """One float32 image a part, inner to outer."""
+def _sums(window: Num[Array, "h w"], sensor: Sensor) -> tuple[Float[Array, "_ _"], ...]:
+    """The sum of each block, ring by ring, nothing hidden yet; or its first pixel; or log-polar cells."""
     window = window.astype(jnp.float32)
     if isinstance(sensor, LogPolarSensor):
         return (logpolar.warp(window, sensor=sensor),)
-    parts = []
+    sums = []
     for (height, width, factor), (top, left) in zip(sensor.rings, _offsets(sensor), strict=True):
         area = window[top : top + height, left : left + width]
         if sensor.pooling == "stride" or factor == 1:
-            parts.append(area[::factor, ::factor])
-            continue
-        # Rows first: they are added up whole before anything is picked apart. Divided once, at the
-        # end: the order of the roundings is then the same in every program that this ends up in.
-        sums = _block_sums(_block_sums(area, factor, 0), factor, 1)
-        sizes = np.outer(np.diff(_block_edges(height, factor)), np.diff(_block_edges(width, factor)))
-        parts.append(sums / sizes.astype(np.float32))
-    return tuple(parts)
+            sums.append(area[::factor, ::factor])
+        else:  # rows first: they are added up whole before anything is picked apart
+            sums.append(_block_sums(_block_sums(area, factor, 0), factor, 1))
+    return tuple(sums)
+
+
+def _means(sums: tuple[Float[Array, "_ _"], ...], sensor: RingSensor) -> tuple[Float[Array, "_ _"], ...]:
+    """Block sums over numbers of pixels: divided once, so that rounding is the same in every program."""
+    if sensor.pooling == "stride":
+        return sums
+    means = []
+    for total, (height, width, factor) in zip(sums, sensor.rings, strict=True):
+        rows, columns = (np.diff(_block_edges(size, factor)) for size in (height, width))
+        means.append(total / np.outer(rows, columns).astype(np.float32))
+    return tuple(means)
 
 
 def _block_sums(x: Float[Array, "_ _"], factor: int, axis: int) -> Float[Array, "_ _"]:

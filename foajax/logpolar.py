@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from foajax.config import LogPolarSensor
 
-_SAMPLES = 16  # sample points along each side of a cell, to measure how much of it lies in a pixel
+_SAMPLES = 32  # sample points along each side of a cell, to measure how much of it lies in a pixel
 
 
 def warp(window: Float[Array, "side side"], *, sensor: LogPolarSensor) -> Float[Array, "rings wedges"]:

@@ -67,7 +67,7 @@ class A3CTorso(nn.Module):
         return x.reshape(x.shape[0], -1)
 
 
-_TORSOS = {"nature": NatureTorso, "a3c": A3CTorso}
+TORSOS = {"nature": NatureTorso, "a3c": A3CTorso}
 _SMALLEST_IMAGE = 8  # below it (a 5x5 periphery) the values go straight to the next layer
 
 
@@ -113,7 +113,7 @@ class Network(nn.Module):
 
     def features(self, images: Sequence[Float[Array, "N _ _ _"]]) -> Float[Array, "N F"]:
         """What the torso makes of the sensor's images, concatenated; then the dense layer if there is one."""
-        torso = _TORSOS[self.config.torso]
+        torso = TORSOS[self.config.torso]
         parts = [
             torso(name=f"torso_{i}")(x) if min(x.shape[1:3]) >= _SMALLEST_IMAGE else x.reshape(x.shape[0], -1)
             for i, x in enumerate(images)

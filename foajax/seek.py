@@ -1,14 +1,15 @@
 """Seek: a task of our own in which the gaze has to move.
 
-One object at a time, 8x8 pixels on black, lies somewhere in the frame for 16 steps; then the next
-one appears elsewhere; six of them make an episode. An object is to be *taken* if it is striped
-horizontally and *left* if it is striped vertically. The stripes are one pixel wide, so that a mean
-over any block of even sides shows where the object is and never what it is: that takes full
-resolution, a fovea on the object. Objects lie at multiples of 4 pixels; a gaze that moves by 4 or
-8 keeps the blocks of a ring aligned with them.
+One object, 8x8 pixels on black, starts at the centre and wanders over the frame, 2 pixels a step.
+It is striped horizontally where it should be *taken* and vertically where it should be *left*;
+every 8 steps a coin decides anew which, and the object takes a new heading. Each step the natural
+action earns 1/8 if it suits the stripes and -1/8 if not; after 96 steps the episode ends.
 
-The eye gets time to travel: only in an object's last 8 steps is the natural action scored, with
-1/8 if it suits the object and -1/8 if not.
+The stripes are one pixel wide and lie on even pixels, so that the mean of a block of even sides,
+on even pixels too, shows where the object is and never what it is: that takes full resolution, a
+fovea on the object. (A gaze that moves by an even number of pixels keeps a ring's blocks there.)
+A greedy 16x16 fovea that moves 4 or 8 pixels a step never loses the object: it can earn as much as
+who sees the whole frame.
 """
 
 from __future__ import annotations
@@ -22,20 +23,20 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from foajax.jax_envs import Task
 
-LEAVE, TAKE = 0, 1  # the natural actions, and the kinds of objects that they suit
-OBJECTS = 6  # an episode
-LIFETIME = 16  # steps that an object stays
-SCORED = 8  # of them, the last, are scored
-SIZE = 8  # pixels of an object's side
-GRID = 4  # pixels between the places where an object may lie
+LEAVE, TAKE = 0, 1  # the natural actions, and the kinds of stripes that they suit
+LEGS = 12  # an episode
+LEG = 8  # steps between two draws of kind and heading
+SIZE = 8  # pixels of the object's side
+SPEED = 2  # pixels a step, along an axis or, diagonally, along both
+HEADINGS = ((-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1))
 
 
 class SeekState(NamedTuple):
-    """One episode: the objects, drawn when it begins, and the time."""
+    """One episode, drawn as a whole when it begins, and the time in it."""
 
-    corner: Int[Array, "objects 2"]  # (y, x) of the upper left pixel
-    kind: Int[Array, "objects"]  # LEAVE or TAKE
-    time: Int[Array, ""]  # steps taken, 0 .. OBJECTS * LIFETIME
+    path: Int[Array, "steps+1 2"]  # (y, x) of the object's upper left pixel at each time
+    kind: Int[Array, "legs"]  # LEAVE or TAKE
+    time: Int[Array, ""]  # steps taken, 0 .. LEGS * LEG
 
 
 def task(frame_shape: tuple[int, int]) -> Task:
@@ -45,23 +46,23 @@ def task(frame_shape: tuple[int, int]) -> Task:
         frame_shape=frame_shape,
         start=partial(_start, frame_shape),
         advance=_advance,
-        draw=partial(_draw, frame_shape),
+        draw=lambda state: draw_object(frame_shape, state.path[state.time], current_kind(state)),
     )
 
 
 def optimal_return() -> float:
-    """The return of who sees every object's stripes from its 8th step on: one point an object."""
-    return float(OBJECTS)
+    """The return of who sees the stripes at every step: one point a leg."""
+    return float(LEGS)
 
 
 def random_return() -> float:
-    """The expected return of who does not see the stripes, whatever the policy: right half of the time."""
+    """The expected return of who never sees the stripes, whatever the policy: right half of the time."""
     return 0.0
 
 
-def current(state: SeekState) -> Int[Array, ""]:
-    """Index of the object in the frame."""
-    return jnp.minimum(state.time // LIFETIME, OBJECTS - 1)
+def current_kind(state: SeekState) -> Int[Array, ""]:
+    """The action, and stripes, that are right now: LEAVE or TAKE."""
+    return state.kind[jnp.minimum(state.time // LEG, LEGS - 1)]
 
 
 def draw_object(frame_shape: tuple[int, int], corner: Int[Array, "2"], kind: Int[Array, ""]) -> UInt8[Array, "H W"]:
@@ -74,23 +75,21 @@ def draw_object(frame_shape: tuple[int, int], corner: Int[Array, "2"], kind: Int
 
 
 def _start(frame_shape: tuple[int, int], key: Key[Array, ""]) -> SeekState:
-    key_corner, key_kind = jax.random.split(key)
-    places = jnp.asarray([(side - SIZE) // GRID + 1 for side in frame_shape])
+    key_heading, key_kind = jax.random.split(key)
+    heading = jnp.asarray(HEADINGS)[jax.random.randint(key_heading, (LEGS,), 0, len(HEADINGS))]
+    moves = jnp.repeat(SPEED * heading, LEG, axis=0)
+    moved = jnp.concatenate([jnp.zeros((1, 2), jnp.int32), jnp.cumsum(moves, axis=0)])
+    # The path of a ball that bounces is that of one that does not, folded at the borders; all even.
+    last = 2 * ((jnp.asarray([frame_shape]) - SIZE) // 2)
+    unfolded = last // 4 * 2 + moved
     return SeekState(
-        corner=GRID * jax.random.randint(key_corner, (OBJECTS, 2), 0, places),
-        kind=jax.random.randint(key_kind, (OBJECTS,), 0, 2),
+        path=last - jnp.abs(unfolded % jnp.maximum(2 * last, 1) - last),
+        kind=jax.random.randint(key_kind, (LEGS,), 0, 2),
         time=jnp.int32(0),
     )
 
 
 def _advance(state: SeekState, action: Int[Array, ""]) -> tuple[SeekState, Float[Array, ""], Bool[Array, ""]]:
-    right = action == state.kind[current(state)]
-    scored = state.time % LIFETIME >= LIFETIME - SCORED
-    reward = jnp.where(scored, jnp.where(right, 1 / SCORED, -1 / SCORED), 0.0)
+    reward = jnp.where(action == current_kind(state), 1 / LEG, -1 / LEG)
     time = state.time + 1
-    return state._replace(time=time), reward, time >= OBJECTS * LIFETIME
-
-
-def _draw(frame_shape: tuple[int, int], state: SeekState) -> UInt8[Array, "H W"]:
-    index = current(state)
-    return draw_object(frame_shape, state.corner[index], state.kind[index])
+    return state._replace(time=time), reward, time >= LEGS * LEG

@@ -113,7 +113,8 @@ def _look(
 ) -> tuple[tuple[Float[Array, "_ _ 1"], ...], Float[Array, "H W 1"]]:
     """What the sensor gives, and that put back in its place."""
     images = sense(frame, focal_point, sensor=sensor)
-    return images, picture(images, focal_point, sensor=sensor, frame_shape=frame.shape)
+    shape = (frame.shape[0], frame.shape[1])
+    return images, picture(images, focal_point, sensor=sensor, frame_shape=shape)
 
 
 def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.Image:

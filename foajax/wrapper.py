@@ -114,10 +114,8 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
         """(y, x) in frame pixels, int32 [B, 2]: where the last frames were sensed."""
         return self._focal_point
 
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict, dict]:
-        """Begins the episodes, those of `options["reset_mask"]` where it is given."""
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """Begins the episodes, those of `options["reset_mask"]` where it is given; `seed` may be a list."""
         if seed is not None:
             self._random = np.random.default_rng([s or 0 for s in np.atleast_1d(seed)])
         started = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
@@ -151,9 +149,7 @@ class _Eye:
     @classmethod
     def of(cls, space: gymnasium.Space, sensor: Sensor | str, gaze: GazeConfig | None) -> _Eye:
         """Checks that the parts fit each other."""
-        if not _is_pixels(space):
-            accepted = "a Box of uint8 or float pixels, [H, W], [H, W, 1] or [H, W, 3]"
-            raise ConfigError(f"observation_space={' '.join(str(space).split())[:80]}: accepted is {accepted}")
+        box = _pixels(space)
         if isinstance(sensor, str):
             experiment = compose([f"experiment={sensor}"])
             sensor, gaze = experiment.sensor, gaze or dataclasses.replace(experiment.gaze, mode="learned")
@@ -161,15 +157,15 @@ class _Eye:
         if not gaze.learned:
             raise ConfigError(f"gaze.mode={gaze.mode}: accepted is learned, for visual actions from outside")
         # What a run is checked for, a wrapped environment is checked for too.
-        Config(name="wrapper", sensor=sensor, gaze=gaze, env=EnvConfig(frame_shape=space.shape[:2]))
-        return cls(box=space, sensor=sensor, gaze=gaze)
+        Config(name="wrapper", sensor=sensor, gaze=gaze, env=EnvConfig(frame_shape=(box.shape[0], box.shape[1])))
+        return cls(box=box, sensor=sensor, gaze=gaze)
 
     @property
     def observation_space(self) -> gymnasium.Space:
         """Of one environment."""
         low, high = self.range
-        channels = self.box.shape[2] if len(self.box.shape) == 3 else 1
-        shapes = [(h, w, channels) for h, w, _ in image_shapes(self.sensor, self.box.shape[:2])]
+        height, width, *channels = self.box.shape
+        shapes = [(h, w, *(channels or [1])) for h, w, _ in image_shapes(self.sensor, (height, width))]
         images = self.named([spaces.Box(low, high, shape, np.float32) for shape in shapes])
         return spaces.Dict({**images, "focal_point": spaces.Box(-1.0, 1.0, (2,), np.float32)})
 
@@ -204,18 +200,21 @@ class _Eye:
         seed: UInt32[Array, ""],
     ) -> tuple[dict[str, Float[Array, "..."]], Int[Array, "2"]]:
         """The observation and where it was sensed: moved from `focal_point`, or the start of an episode."""
-        shape = frame.shape[:2]
-        where = {"gaze": self.gaze, "window": self.sensor.window, "frame_shape": shape}
+        shape = (frame.shape[0], frame.shape[1])
+        where: dict[str, Any] = {"gaze": self.gaze, "window": self.sensor.window, "frame_shape": shape}
         start = gazes.start(jax.random.key(seed), **where)
         focal_point = jnp.where(is_first, start, gazes.move(focal_point, vision_action, **where))
         images = sense(frame.astype(jnp.float32) * self.scale, focal_point, sensor=self.sensor)
         # A mean may round to just outside the range, and then would not be of the observation space.
-        images = self.named([jnp.clip(image, *self.range) for image in images])
-        return {**images, "focal_point": gazes.to_unit(focal_point, shape)}, focal_point
+        named = self.named([jnp.clip(image, *self.range) for image in images])
+        return {**named, "focal_point": gazes.to_unit(focal_point, shape)}, focal_point
 
 
-def _is_pixels(space: gymnasium.Space) -> bool:
-    if not isinstance(space, spaces.Box):
-        return False
-    number = space.dtype == np.uint8 or np.issubdtype(space.dtype, np.floating)
-    return number and (len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[2] in (1, 3)))
+def _pixels(space: gymnasium.Space) -> spaces.Box:
+    """The space itself, if it is one of pixels."""
+    if isinstance(space, spaces.Box):
+        number = space.dtype == np.uint8 or np.issubdtype(space.dtype, np.floating)
+        if number and (len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[2] in (1, 3))):
+            return space
+    accepted = "a Box of uint8 or float pixels, [H, W], [H, W, 1] or [H, W, 3]"
+    raise ConfigError(f"observation_space={' '.join(str(space).split())[:80]}: accepted is {accepted}")

@@ -118,7 +118,7 @@ def test_unit_coordinates_by_hand_and_back():
     np.testing.assert_array_equal(units[1], 0)
     points = jnp.asarray([(y, x) for y in range(80) for x in range(90)], jnp.int32)
     there = jax.vmap(functools.partial(gaze.to_unit, frame_shape=FRAME))(points)
-    assert -1 <= there.min() and there.max() < 1
+    assert there.min() >= -1 and there.max() < 1
     np.testing.assert_array_equal(jax.jit(gaze.from_unit, static_argnums=1)(there, FRAME), points)
     np.testing.assert_array_equal(gaze.from_unit(jnp.array([1.0, -3.0]), FRAME), [79, 0])
 

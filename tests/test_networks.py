@@ -14,7 +14,7 @@ EXPERIMENTS = compose.list_experiments()
 def build(*overrides):
     config = compose.compose(overrides)
     network = make_network(config, 4)
-    return config, network, initial_params(network, jax.random.key(0), config)
+    return config, network, lambda: jax.jit(lambda key: initial_params(network, key, config))(jax.random.key(0))
 
 
 def inputs(config, steps, batch):
@@ -34,7 +34,8 @@ def inputs(config, steps, batch):
 def test_every_experiment_has_four_outputs_or_two(experiment, torso):
     config, network, params = build(f"experiment={experiment}", f"network={torso}")
     roi, focal_point, is_first = inputs(config, 3, 2)
-    output, _ = jax.eval_shape(network.apply, params, roi, focal_point, is_first, initial_core_state(network, 2))
+    state = initial_core_state(network, 2)
+    output, _ = jax.eval_shape(lambda: network.apply(params(), roi, focal_point, is_first, state))
     assert output.natural_logits.shape == (3, 2, 4) and output.natural_value.shape == (3, 2)
     if config.gaze.learned:
         assert output.vision_logits.shape == (3, 2, config.gaze.actions) and output.vision_value.shape == (3, 2)
@@ -49,6 +50,7 @@ def test_only_a_canvas_tells_its_place_by_itself():
 
 def test_a_split_unroll_is_the_whole():
     config, network, params = build("experiment=constant50_sub2_packed")
+    params = params()
     roi, focal_point, is_first = inputs(config, 6, 2)
     state = initial_core_state(network, 2)
     whole, last = network.apply(params, roi, focal_point, is_first, state)
@@ -61,6 +63,7 @@ def test_a_split_unroll_is_the_whole():
 
 def test_environments_do_not_mix_and_episodes_do_not_leak():
     config, network, params = build("experiment=constant50_sub2_packed")
+    params = params()
     roi, focal_point, is_first = inputs(config, 5, 2)
     state = initial_core_state(network, 2)
 
@@ -77,7 +80,7 @@ def test_environments_do_not_mix_and_episodes_do_not_leak():
 def test_the_initial_policies_are_about_uniform():
     config, network, params = build("experiment=constant70")
     roi, focal_point, is_first = inputs(config, 3, 2)
-    output, _ = network.apply(params, roi, focal_point, is_first, initial_core_state(network, 2))
+    output, _ = network.apply(params(), roi, focal_point, is_first, initial_core_state(network, 2))
     for logits in (output.natural_logits, output.vision_logits):
         probabilities = jax.nn.softmax(logits)
         np.testing.assert_allclose(probabilities, 1 / logits.shape[-1], atol=0.02)

@@ -1,0 +1,149 @@
+"""How long does sensing take: per sensor, on large frames, and against OpenCV?
+
+    python benchmarks/foveation.py [out=results.json]
+
+Prints medians over one run, with the device and the versions. Frames are float32 and already in the
+device's memory, results stay there; what is compared is timed in turns, so that both see the same
+machine. Run it on an idle one.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from foajax.config import LogPolarSensor, RingSensor, Sensor
+from foajax.foveation import sense
+
+DECREASING = ((30, 30, 1), (50, 50, 2), (70, 70, 4))
+TABLE_II = {
+    "nonfoa": RingSensor(((80, 80, 1),)),
+    "constant50_sub1": RingSensor(((50, 50, 1),)),
+    "constant50_sub2": RingSensor(((50, 50, 2),)),
+    "constant70": RingSensor(((70, 70, 2),)),
+    "decreasing": RingSensor(DECREASING),
+    "constant70_p": RingSensor(((70, 70, 2),), peripheral=(5, 5)),
+    "decreasing_p": RingSensor(DECREASING, peripheral=(5, 5)),
+}
+CONSTANT70_PACKED = RingSensor(((70, 70, 2),), layout="packed")
+
+
+def sensors() -> dict[str, Sensor]:
+    """Every sensor of Table II on the canvas and packed, and the log-polar ones."""
+    packed = {
+        f"{name} packed": RingSensor(s.rings, peripheral=s.peripheral, layout="packed") for name, s in TABLE_II.items()
+    }
+    logpolar = {f"logpolar {s}": LogPolarSensor(sampling=s) for s in ("area", "bilinear")}
+    return {**{f"{name} canvas": s for name, s in TABLE_II.items()}, **packed, **logpolar}
+
+
+def median_times(functions: Sequence[Callable[[], object]], seconds: float = 1.0) -> list[float]:
+    """Median duration of each call in microseconds, called in turns for about `seconds` each."""
+    for function in functions:  # compile
+        jax.block_until_ready(function())
+    times: list[list[float]] = [[] for _ in functions]
+    end = time.perf_counter() + seconds * len(functions)
+    while time.perf_counter() < end or len(times[0]) < 5:
+        for function, durations in zip(functions, times, strict=True):
+            begin = time.perf_counter()
+            jax.block_until_ready(function())
+            durations.append((time.perf_counter() - begin) * 1e6)
+    return [statistics.median(durations) for durations in times]
+
+
+def batch(size: int, shape: tuple[int, int] = (80, 80)) -> tuple[np.ndarray, np.ndarray]:
+    """Random frames, and focal points at which a 70x70 area lies inside 80x80."""
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(size, *shape)).astype(np.float32), rng.integers(35, 46, (size, 2)).astype(np.int32)
+
+
+def sensing(sensor: Sensor, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
+    """A compiled call on arrays in the device's memory; vmapped where there is a batch."""
+    run = functools.partial(sense, sensor=sensor)
+    compiled = jax.jit(jax.vmap(run) if frames.ndim == 3 else run)
+    return functools.partial(compiled, jnp.asarray(frames), jnp.asarray(points))
+
+
+def per_sensor() -> dict[str, float]:
+    """Microseconds to sense 32 frames of 80x80."""
+    results = {}
+    frames, points = batch(32)
+    for name, sensor in sensors().items():
+        centred = np.full_like(points, 40)
+        inside = points if isinstance(sensor, RingSensor) and sensor.window[0] <= 70 else centred
+        (results[name],) = median_times([sensing(sensor, frames, inside)])
+        print(f"  {name:24} {results[name]:8.0f} us")
+    return results
+
+
+def large_frame() -> dict[str, float]:
+    """Microseconds for one frame, small and large, seen by the same sensor."""
+    calls = []
+    for shape in ((80, 80), (1080, 1920)):
+        frames, _ = batch(1, shape)
+        calls.append(sensing(CONSTANT70_PACKED, frames[0], np.array(shape, np.int32) // 2))
+    small, large = median_times(calls)
+    print(f"  80x80 {small:8.1f} us    1080x1920 {large:8.1f} us    ratio {large / small:.2f}")
+    return {"80x80": small, "1080x1920": large, "ratio": large / small}
+
+
+def against_opencv() -> dict[str, float] | None:
+    """Microseconds for the 35x35 views of 256 frames, against a loop over OpenCV's resize."""
+    try:
+        import cv2
+    except ImportError:
+        print("  left out: OpenCV is not installed")
+        return None
+    print(f"  OpenCV {cv2.__version__}, {cv2.getNumThreads()} threads")
+    frames, points = batch(256)
+    out = np.empty((256, 35, 35), np.float32)
+
+    def loop() -> np.ndarray:
+        for index, (y, x) in enumerate(points):
+            window = frames[index, y - 35 : y + 35, x - 35 : x + 35]
+            out[index] = cv2.resize(window, (35, 35), interpolation=cv2.INTER_AREA)
+        return out
+
+    ours = sensing(CONSTANT70_PACKED, frames, points)
+    np.testing.assert_allclose(ours()[0][..., 0], loop(), atol=1e-5)
+    sensed, looped = median_times([ours, loop], seconds=2.0)
+    print(f"  foajax {sensed:8.0f} us    OpenCV {looped:8.0f} us    {looped / sensed:.1f} times faster")
+    return {"foajax": sensed, "opencv": looped, "speedup": looped / sensed}
+
+
+def main(arguments: list[str]) -> None:
+    """Runs all three and writes JSON where `out=<file>` says so."""
+    options = dict(argument.partition("=")[::2] for argument in arguments)
+    if set(options) - {"out"}:
+        sys.exit(f"benchmarks/foveation.py: {' '.join(arguments)}: accepted is out=<file>")
+    results: dict[str, object] = {
+        "device": jax.devices()[0].device_kind,
+        "cpus": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+    }
+    print("  ".join(f"{key} {value}" for key, value in results.items()))
+    print("Sensing 32 frames of 80x80")
+    results["batch32_us"] = per_sensor()
+    print("One frame, constant70 packed")
+    results["large_frame_us"] = large_frame()
+    print("256 frames, constant70 packed, against a loop of OpenCV crop and resize")
+    results["opencv_us"] = against_opencv()
+    if "out" in options:
+        with open(options["out"], "w") as file:
+            json.dump(results, file, indent=2)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,108 @@
+"""Gymnasium's pixel environments as gray frames: `gymnasium:<id>`, the id as `gymnasium.make` takes it.
+
+Of `env` only `frame_shape`, `clip_rewards` and `max_episode_steps` apply; skipped frames, no-ops, lives and sticky
+actions are an emulator's. An id may name the module that registers it, e.g. `gymnasium:my_package:MyGame-v0`.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+
+from foajax.config import Config, ConfigError
+from foajax.types import Outcome, TimeStep
+
+LUMA = np.array([299, 587, 114])  # thousandths of red, green and blue in gray (ITU-R BT.601)
+
+
+class GymnasiumEnvironment:
+    """A batch of one Gymnasium environment, an `envs.Environment`. They step one after another, in `recv`."""
+
+    crop_top: int | None = None
+
+    def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
+        name = config.game.removeprefix("gymnasium:")
+
+        def make_one() -> gymnasium.Env:
+            env = gymnasium.make(name, render_mode="rgb_array" if render else None, disable_env_checker=True)
+            return TimeLimit(env, config.env.max_episode_steps)  # beside a limit of its own
+
+        try:
+            self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
+        except (gymnasium.error.Error, ImportError) as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(f"game={config.game}: accepted is the id of an environment ({reason})") from None
+        observations, actions = self._env.single_observation_space, self._env.single_action_space
+        is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
+        if not (is_pixels and isinstance(actions, spaces.Discrete)):
+            raise ConfigError(
+                f"game={config.game}: accepted is an environment with discrete actions and uint8 images "
+                f"[h, w], [h, w, 1] or [h, w, 3], not {observations} and {actions}"
+            )
+        self.num_envs, self.num_actions = num_envs, int(actions.n)
+        self.screen_shape: tuple[int, ...] = config.env.frame_shape
+        self._first_action, self._seed, self._clip = int(actions.start), seed, config.env.clip_rewards
+        self._rows, self._columns = (
+            area_weights(source, target)
+            for source, target in zip(observations.shape or (), self.screen_shape, strict=False)
+        )
+
+    def reset(self) -> tuple[TimeStep, Outcome]:
+        """Begins all episodes, from the seed."""
+        image, _ = self._env.reset(seed=self._seed)
+        zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
+        self._ended = false
+        timestep = TimeStep(self._frame(image), zeros, is_first=~false, is_terminal=false)
+        return timestep, Outcome(score=zeros, is_over=false)
+
+    def send(self, action: np.ndarray) -> None:
+        """Keeps the actions for `recv`."""
+        self._action = np.asarray(action) + self._first_action
+
+    def recv(self) -> tuple[TimeStep, Outcome]:
+        """Steps every environment."""
+        image, score, terminated, truncated, _ = self._env.step(self._action)
+        score = score.astype(np.float32)
+        timestep = TimeStep(
+            frame=self._frame(image),
+            reward=np.sign(score) if self._clip else score,
+            is_first=self._ended,
+            is_terminal=terminated.copy(),
+        )
+        self._ended = terminated | truncated
+        return timestep, Outcome(score=score, is_over=self._ended)
+
+    def render(self) -> np.ndarray:
+        """What the environments render, uint8 [B, h, w, 3]; of one made with `render`."""
+        return np.stack(self._env.render())
+
+    def close(self) -> None:
+        """Closes every environment."""
+        self._env.close()
+
+    def _frame(self, image: np.ndarray) -> np.ndarray:
+        """uint8 images [B, h, w(, c)] as gray frames [B, H, W]: area means, rounded half up."""
+        if image.ndim == 4:
+            image = (image @ LUMA + 500) // 1000 if image.shape[-1] == 3 else image[..., 0]
+        means = self._rows @ image.astype(np.float32) @ self._columns.T
+        return np.floor(means + np.float32(0.5)).astype(np.uint8)
+
+
+def area_weights(source: int, target: int) -> np.ndarray:
+    """[target, source] float32: the share of each source pixel in each target pixel, along one axis.
+
+    Target pixel i covers source coordinates [i, i + 1) * source / target: a block mean where target divides source;
+    elsewhere, larger or smaller, border pixels count by the part that is covered. Each row sums to 1.
+    """
+    edges = np.arange(target + 1)[:, None] * source / target
+    pixel = np.arange(source)[None, :]
+    covered = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
+    return (np.maximum(covered, 0) * target / source).astype(np.float32)
+
+
+def _is_image(space: spaces.Box) -> bool:
+    is_gray_or_colour = len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[-1] in (1, 3))
+    return space.dtype == np.uint8 and is_gray_or_colour

@@ -1,0 +1,214 @@
+"""The command itself, in real processes: runs, resumes, survives being killed, refuses in one line."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from foajax.store import load_agent, save_agent
+
+TINY = [
+    "sensor=rings",
+    "sensor.rings=[[16,16,2]]",
+    "sensor.layout=packed",
+    "network.dense=16",
+    "network.lstm=16",
+    "env.num_envs=8",
+    "learner.minibatches=2",
+    "learner.rollout_length=5",
+    "train.log_every=0.01",
+]
+
+
+def start(*arguments, module="train", **options):
+    command = [sys.executable, "-m", f"foajax.{module}", *arguments]
+    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+
+
+def finish(*arguments, module="train"):
+    process = start(*arguments, module=module)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def rows(run):
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def wait_for(condition, process, timeout=200):
+    end = time.monotonic() + timeout
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def breakout(tmp_path_factory):
+    """A short run on the real game."""
+    run = tmp_path_factory.mktemp("runs") / "breakout"
+    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=800")
+    assert code == 0, err
+    return run, out
+
+
+def test_a_run_leaves_everything_that_it_promises(breakout):
+    run, out = breakout
+    assert "new run of constant50_sub2_packed on breakout" in out and "done: 800 env_steps" in out
+    assert rows(run)[-1]["env_steps"] == 800
+    for name in ("natural_entropy", "vision_entropy", "loss", "grad_norm", "score", "time"):
+        assert name in rows(run)[-1]
+    assert (run / "config.yaml").exists() and list((run / "tensorboard").iterdir())
+    assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 800
+    assert json.loads((run / "run.json").read_text())["starts"][0]["packages"]["envpool"]
+
+
+def test_a_finished_run_goes_on_when_more_is_asked_for(breakout):
+    run, _ = breakout
+    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=1000")
+    assert code == 0, err
+    assert "resumed at 800 env_steps (episodes start anew, emulators cannot be saved)" in out
+    steps = [row["env_steps"] for row in rows(run)]
+    assert steps == sorted(set(steps)) and steps[-1] == 1000
+
+
+def test_evaluation_plays_whole_games(breakout, tmp_path):
+    run, _ = breakout
+    code, out, err = finish(f"run={run}", "episodes=3", f"json={tmp_path / 'score.json'}", module="evaluate")
+    assert code == 0, err
+    result = json.loads((tmp_path / "score.json").read_text())
+    assert len(result["returns"]) == len(result["lengths"]) == 3 and result["policy"] == "sampled"
+    assert result["mean"] == pytest.approx(np.mean(result["returns"]))
+    assert result["stderr"] == pytest.approx(np.std(result["returns"], ddof=1) / np.sqrt(3))
+    # Five lives of doing next to nothing take well over a hundred steps, and no game is without an end.
+    assert all(100 < length <= 27_000 for length in result["lengths"])
+    assert "constant50_sub2_packed" in out
+
+
+def test_a_shipped_agent_is_the_runs(breakout, tmp_path):
+    run, _ = breakout
+    stored = load_agent(run)
+    save_agent(stored, tmp_path / "agent")
+    shipped = load_agent(tmp_path / "agent")
+    jax.tree.map(
+        np.testing.assert_array_equal, (stored.params, stored.statistics), (shipped.params, shipped.statistics)
+    )
+    assert shipped.env_steps == stored.env_steps and shipped.agent.config.sensor == stored.agent.config.sensor
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
+    words = ["game=seek", *TINY]
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert finish(*words, f"run={whole}", "train.env_steps=1600")[0] == 0
+    for env_steps in (600, 1600):
+        code, out, err = finish(*words, f"run={parts}", f"train.env_steps={env_steps}")
+        assert code == 0, err
+    assert "resumed at 600 env_steps (episodes go on)" in out
+    a, b = load_agent(whole), load_agent(parts)
+    jax.tree.map(np.testing.assert_array_equal, (a.params, a.statistics), (b.params, b.statistics))
+    last, resumed = rows(whole)[-1], rows(parts)[-1]
+    assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in resumed.items() if k != "time"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_saves_and_ends_well(tmp_path, number):
+    process = start("game=seek", *TINY, f"run={tmp_path}", "train.env_steps=100000000")
+    wait_for(lambda: (tmp_path / "metrics.jsonl").exists() and rows_or_none(tmp_path), process)
+    process.send_signal(number)
+    begin = time.monotonic()
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert time.monotonic() - begin < 10
+    saved = max(int(p.name) for p in (tmp_path / "checkpoints").iterdir())
+    assert f"{signal.Signals(number).name}: saved at {saved:,} env_steps" in out
+    assert rows(tmp_path)[-1]["env_steps"] == saved
+
+
+def rows_or_none(run):
+    try:
+        return rows(run)
+    except ValueError:
+        return None
+
+
+def killed_again_and_again(run, words, times, seed):
+    """SIGKILL at random moments; returns the env_steps of the newest checkpoint after each."""
+    rng = random.Random(seed)
+    reached = [0]
+    for _ in range(times):
+        process = start(*words, f"run={run}", "train.env_steps=100000000", "train.checkpoint_every=0.5")
+        before = reached[-1]
+        wait_for(lambda before=before: newest(run) > before, process)
+        time.sleep(rng.uniform(0, 2))
+        process.kill()
+        process.communicate()
+        for line in (run / "metrics.jsonl").read_text().splitlines()[:-1]:
+            json.loads(line)
+        reached.append(newest(run))
+    return reached
+
+
+def newest(run):
+    directory = run / "checkpoints"
+    return max((int(n) for n in os.listdir(directory) if n.isdigit()), default=0) if directory.exists() else 0
+
+
+def test_sigkill_costs_no_more_than_the_steps_since_the_last_checkpoint(tmp_path):
+    reached = killed_again_and_again(tmp_path, ["game=seek", *TINY], times=2, seed=0)
+    assert reached == sorted(reached) and reached[-1] > reached[1] > 0
+    code, out, err = finish("game=seek", *TINY, f"run={tmp_path}", f"train.env_steps={reached[-1]}")
+    assert code == 0, err
+    assert f"resumed at {reached[-1]:,} env_steps" in out
+    assert all(row["env_steps"] <= reached[-1] for row in rows(tmp_path))
+
+
+@pytest.mark.slow
+def test_ten_times_sigkill_on_breakout(tmp_path):
+    reached = killed_again_and_again(tmp_path, TINY, times=10, seed=1)
+    assert reached == sorted(reached) and len(set(reached)) == 11
+
+
+def test_two_processes_do_not_share_a_run(tmp_path):
+    process = start("game=seek", *TINY, f"run={tmp_path}", "train.env_steps=100000000")
+    wait_for(lambda: (tmp_path / "lock").exists() and (tmp_path / "lock").read_text(), process)
+    code, _, err = finish("game=seek", *TINY, f"run={tmp_path}")
+    process.kill()
+    process.communicate()
+    assert code == 2 and len(err.splitlines()) == 1 and f"in use by process {process.pid}" in err
+
+
+@pytest.mark.parametrize(
+    "word, said",
+    [
+        ("learner.learning_rat=1", "learner.learning_rat=1: unknown key"),
+        ("sensor.rings=[[90,90,2]]", "inside env.frame_shape=80x80"),
+        ("sensor.rings=[[16,16,40]]", "1 <= factor <= height and width"),
+        ("env.num_envs=many", "env.num_envs=many: accepted is an integer"),
+        ("game=no_such_game", "game=no_such_game: accepted is"),
+        ("experiment=constant71", "experiment=constant71: accepted is one of"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, word, said):
+    code, out, err = finish(*TINY, word, f"run={tmp_path / 'run'}")
+    assert code == 2 and out == ""
+    assert len(err.splitlines()) == 1 and err.startswith("foajax: error: ") and said in err
+
+
+def test_another_meaning_is_refused_by_name(breakout):
+    run, _ = breakout
+    code, _, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "learner.learning_rate=0.01")
+    assert code == 2 and len(err.splitlines()) == 1 and "learner.learning_rate=0.01: the run in" in err
+
+
+def test_a_profile_is_a_trace_and_a_table(tmp_path):
+    code, out, err = finish(*TINY, "profile=true", f"run={tmp_path}")
+    assert code == 0, err
+    assert all(part in out for part in ("env", "act", "update", "us a step"))
+    assert list((tmp_path / "profile").rglob("*.xplane.pb"))
