@@ -15,9 +15,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from foajax import cli, envs
+from foajax import cli
 from foajax.agent import Agent
 from foajax.config import Config, ConfigError
+from foajax.envs import make
 from foajax.store import load_agent
 from foajax.types import FrameStatistics, Params
 
@@ -64,7 +65,7 @@ def play(
     """
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
-    environment = envs.make(config, num_envs=num_envs, seed=_EVALUATION_SEED + seed)
+    environment = make(config, num_envs=num_envs, seed=_EVALUATION_SEED + seed)
     agent = Agent(config, environment.num_actions, environment.crop_top)
     act = jax.jit(functools.partial(agent.act, greedy=greedy))
     state = agent.initial_state(num_envs)
