@@ -6,11 +6,21 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
-__all__ = ["Agent", "Config", "ConfigError", "FoveatedObservation", "FoveatedVectorObservation", "load_agent", "sense"]
+__all__ = [
+    "Agent",
+    "Config",
+    "ConfigError",
+    "FoveatedObservation",
+    "FoveatedVectorObservation",
+    "LogPolarSensor",
+    "RingSensor",
+    "load_agent",
+    "sense",
+]
 
 if TYPE_CHECKING:
     from foajax.agent import Agent
-    from foajax.config import Config, ConfigError
+    from foajax.config import Config, ConfigError, LogPolarSensor, RingSensor
     from foajax.foveation import sense
     from foajax.store import load_agent
     from foajax.wrapper import FoveatedObservation, FoveatedVectorObservation
@@ -19,6 +29,8 @@ else:
         "Agent": "agent",
         "Config": "config",
         "ConfigError": "config",
+        "LogPolarSensor": "config",
+        "RingSensor": "config",
         "FoveatedObservation": "wrapper",
         "FoveatedVectorObservation": "wrapper",
         "load_agent": "store",

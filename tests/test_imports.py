@@ -42,20 +42,22 @@ WORLD = {
     "display",
     "durable",
     "envs",
+    "gymnasium_env",
     "jax_envs",
     "logger",
+    "probes",
     "render",
     "rundir",
     "seek",
 }
 # Where the two meet: the loop that acts, and the commands around a trained agent.
-MEETING = {"cost", "evaluate", "profiling", "report", "rollout", "show", "store", "train"}
+MEETING = {"cost", "evaluate", "profiling", "report", "rollout", "show", "store", "train", "wrapper"}
 
 # What only some may import, so that an engine or a library can be replaced in one place.
 ONLY_IN = {
     "envpool": {"envs"},
     "ale_py": {"envs"},
-    "gymnasium": {"envs"},
+    "gymnasium": {"envs", "gymnasium_env", "wrapper"},
     "flax": {"networks"},
     "optax": {"learner", "optimizer"},
     "orbax": {"checkpoint"},
@@ -117,7 +119,7 @@ def test_a_replaceable_library_is_imported_in_one_place(package):
 
 def test_config_needs_the_standard_library_only():
     assert OTHERS["config"] <= sys.stdlib_module_names
-    assert OTHERS["types"] <= sys.stdlib_module_names | {"jaxtyping"}
+    assert OTHERS["types"] <= sys.stdlib_module_names | {"jaxtyping", "numpy"}
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if RANK.get(name, len(CORE)) < len(CORE) - 1])
