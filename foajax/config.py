@@ -69,7 +69,7 @@ class LogPolarSensor:
     kind: Literal["logpolar"] = "logpolar"
     rings: int = 35
     wedges: int = 35
-    fovea: float = 3.0  # radius of the innermost sampling circle, frame pixels
+    fovea: float = 3.0  # radius of the innermost ring, a disc, frame pixels
     radius: float = 40.0  # outer radius, frame pixels
     sampling: Literal["area", "bilinear"] = "area"
 

@@ -4,7 +4,8 @@ All engines show an episode's end the same way (*next-step* auto-reset): the ste
 frame; the step after it ignores its action and gives the next episode's first frame, with `is_first` and reward 0.
 
 For the learner an episode ends as a terminal when the game is over or, with `env.episodic_life`, when a life is
-lost; then the game goes on in the learner's next episode. At the step limit it ends without a terminal.
+lost; then the game goes on in the learner's next episode. At the step limit it ends without a terminal. (A game that
+ends early among the skipped frames shows the frame before once more.)
 
 The Atari engines play the same games, not the same way. Where an episode begins, EnvPool makes its 0 to
 `env.noop_max` no-ops and then one more action, FIRE where the game has it (a no-op where not, or where

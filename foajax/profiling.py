@@ -41,25 +41,16 @@ class Stopwatch:
         return run
 
 
-class _TimedEnvironment:
-    """An environment whose steps are timed."""
-
-    def __init__(self, environment: Environment, stopwatch: Stopwatch) -> None:
-        self._environment = environment
-        self.send = stopwatch.timed("env", environment.send)
-        self.recv = stopwatch.timed("env", environment.recv)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._environment, name)
-
-
 def profile(config: Config, environments: list[Environment], directory: str) -> None:
     """Runs a few rollouts and updates; writes a `jax.profiler` trace to `directory` and prints the table."""
     agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
     programs, state = make_programs(agent), make_state(agent, config.seed)
     stopwatch = Stopwatch()
     timed = Programs(act=stopwatch.timed("act", programs.act), update=stopwatch.timed("update", programs.update))
-    collector = Collector(agent, timed, [_TimedEnvironment(e, stopwatch) for e in environments], seed=config.seed)
+    for environment in environments:
+        for name in ("send", "recv"):
+            setattr(environment, name, stopwatch.timed("env", getattr(environment, name)))
+    collector = Collector(agent, timed, environments, seed=config.seed)
 
     def rollouts(count: int, first: int) -> None:
         nonlocal state

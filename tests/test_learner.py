@@ -169,3 +169,32 @@ def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
     first, second, other = (jax.tree.leaves(loop.state.params) for loop in runs)
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+PROBE = [*VIEW, "learner.learning_rate=2e-3", "learner.natural.gamma=0.5", "train.env_steps=1000000"]
+
+
+@pytest.mark.parametrize(
+    "probe, value",
+    [
+        ("delay", 0.75),  # the mean of gamma, a step before the reward, and 1
+        ("match", 1.0),  # of the action that suits what is seen
+    ],
+)
+def test_the_value_of_a_probe_is_learned(probe, value):
+    loop = Loop(f"game=probe:{probe}", *PROBE)
+    loop.run(250)
+    learned = np.mean([row["natural_value"] for row in loop.metrics[-40:]])
+    np.testing.assert_allclose(learned, value, atol=0.05)
+
+
+def test_the_core_learns_to_remember():
+    loop = Loop("game=probe:memory", *PROBE, "learner.natural.gamma=0.9")
+    assert loop.run(400) > 0.8 / 5  # the best is a reward in four steps and a reset; 0 without memory
+
+
+def test_the_gaze_learns_to_move_where_the_cue_is():
+    words = ["gaze=learned", "sensor.rings=[[16,16,1]]", "learner.natural.gamma=0.9", "learner.rollout_length=17"]
+    loop = Loop("game=probe:gaze", *PROBE, *words)
+    # Four moves bring the cue into view, 12 of 17 steps are left to be right in; a gaze that stays earns 0.
+    assert loop.run(500) > 0.75 * 12 / 17
