@@ -88,6 +88,7 @@ def test_the_other_torso():
     assert products < record["torso_flops"] < 1.02 * products
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "cost.json"
     assert cli.run(cost.cost, ["experiments=constant70_packed", "repeats=3", f"json={out}"]) == 0

@@ -193,6 +193,7 @@ def test_the_core_learns_to_remember():
     assert loop.run(400) > 0.8 / 5  # the best is a reward in four steps and a reset; 0 without memory
 
 
+@pytest.mark.slow
 def test_the_gaze_learns_to_move_where_the_cue_is():
     words = ["gaze=learned", "sensor.rings=[[16,16,1]]", "learner.natural.gamma=0.9", "learner.rollout_length=17"]
     loop = Loop("game=probe:gaze", *PROBE, *words)
