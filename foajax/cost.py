@@ -21,7 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -102,18 +102,13 @@ def decide(
     """The network's part: torso to sampling, and the gaze's move."""
     batch = focal_point.shape[0]
     natural_key, vision_key = jax.random.split(key)
-    output, state = agent.network.apply(
-        params,
-        [image[None] for image in roi],
-        agent.unit(focal_point)[None],
-        jnp.zeros((1, batch), bool),
-        core_state,
-    )
+    images, is_first = [image[None] for image in roi], jnp.zeros((1, batch), bool)
+    output, core_state = agent.forward(params, images, agent.unit(focal_point)[None], is_first, core_state)
     output = jax.tree.map(lambda x: x[0], output)
     natural_action = jax.random.categorical(natural_key, output.natural_logits)
     vision_action, _ = agent.choose_vision(vision_key, output, False)
     age = jnp.zeros(batch, jnp.int32)
-    return natural_action, agent.move(focal_point, vision_action, age), cast(CoreState, state)
+    return natural_action, agent.move(focal_point, vision_action, age), core_state
 
 
 def decision(
