@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -16,7 +15,7 @@ from foajax.agent import Agent
 from foajax.config import Config
 from foajax.envs import Environment
 from foajax.programs import Programs, make_programs, make_state
-from foajax.rollout import Collector
+from foajax.rollout import Collector, update_on
 
 _WARM_UP, _ROLLOUTS = 3, 5
 
@@ -52,19 +51,18 @@ def profile(config: Config, environments: list[Environment], directory: str) -> 
             setattr(environment, name, stopwatch.timed("env", getattr(environment, name)))
     collector = Collector(agent, timed, environments, seed=config.seed)
 
-    def rollouts(count: int, first: int) -> None:
+    def run(count: int, first: int) -> None:
         nonlocal state
         for i in range(first, first + count):
-            for rollout in collector.collect(state, i * config.learner.rollout_length)[0]:
-                for index in range(config.learner.minibatches // config.env.groups):
-                    state, _ = timed.update(state, rollout, np.int32(index), np.bool_(True))
+            rollouts, _ = collector.collect(state, i * config.learner.rollout_length)
+            state, _ = update_on(rollouts, state, timed, config.learner)
 
-    rollouts(_WARM_UP, 0)
+    run(_WARM_UP, 0)
     stopwatch.seconds.clear()
     stopwatch.calls.clear()
     with jax.profiler.trace(directory):
         begin = time.perf_counter()
-        rollouts(_ROLLOUTS, _WARM_UP)
+        run(_ROLLOUTS, _WARM_UP)
         total = time.perf_counter() - begin
     _print(config, stopwatch, total)
     print(f"trace: {directory} (TensorBoard's profiler or Perfetto show it)")

@@ -9,13 +9,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Array
 
 from foajax.agent import Agent
+from foajax.config import LearnerConfig
 from foajax.envs import Environment
+from foajax.learner import Metrics
 from foajax.programs import Programs, acting_key, empty_rollout
 from foajax.types import ActorState, Outcome, Rollout, TimeStep, TrainState
+
+
+def update_on(
+    rollouts: Sequence[Rollout], state: TrainState, programs: Programs, learner: LearnerConfig
+) -> tuple[TrainState, list[Metrics]]:
+    """All minibatches of the groups' rollouts, `epochs` times, one after another; nothing is waited for."""
+    metrics = []
+    for epoch in range(learner.epochs):
+        for rollout in rollouts:
+            for index in range(learner.minibatches // len(rollouts)):
+                state, row = programs.update(state, rollout, np.int32(index), np.bool_(epoch == 0))
+                metrics.append(row)
+    return state, metrics
 
 
 class Group(NamedTuple):
@@ -66,6 +82,15 @@ class Collector:
             # as row 0 of the next rollout.
             self._act(i, acting, self._length, first_step + self._length)
         return [group.rollout for group in self.groups], outcomes
+
+    def decide(self, state: TrainState, first_step: int) -> None:
+        """A rollout's decisions without the environments, waited for: what acting alone costs."""
+        acting = (state.params, state.statistics)
+        for row in range(self._length):
+            for i in range(len(self.groups)):
+                action, actor_state = self._act(i, acting, row, first_step + row)
+                self.groups[i] = self.groups[i]._replace(actor_state=actor_state)
+                jax.block_until_ready(action)
 
     @property
     def resumable(self) -> bool:

@@ -20,10 +20,10 @@ from foajax.config import Config, ConfigError
 from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state
-from foajax.rollout import Collector
+from foajax.rollout import Collector, update_on
 from foajax.rundir import RunDir, open_run
 from foajax.store import CHECKPOINTS, save_facts
-from foajax.types import Outcome, Rollout
+from foajax.types import Outcome
 
 _GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best
 
@@ -95,7 +95,7 @@ class Run:
             if metrics and now - logged >= train.log_every:
                 self._log(metrics)
                 logged = now
-            metrics = self._update(rollouts)
+            self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
             self._track(outcomes)
             self._env_steps += self._rollout_steps
             if now - saved >= train.checkpoint_every:
@@ -104,19 +104,6 @@ class Run:
         self._check(metrics)
         if metrics:
             self._log(metrics)
-
-    def _update(self, rollouts: list[Rollout]) -> list[Metrics]:
-        """All minibatches of the groups' rollouts, `epochs` times, one after another."""
-        learner = self._config.learner
-        metrics = []
-        for epoch in range(learner.epochs):
-            for rollout in rollouts:
-                for index in range(learner.minibatches // len(rollouts)):
-                    self._state, row = self._programs.update(
-                        self._state, rollout, np.int32(index), np.bool_(epoch == 0)
-                    )
-                    metrics.append(row)
-        return metrics
 
     def _check(self, metrics: list[Metrics]) -> None:
         """Stops a run whose updates are not finite time after time."""

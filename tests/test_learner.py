@@ -8,7 +8,7 @@ import pytest
 from foajax import compose, learner
 from foajax.agent import Agent
 from foajax.programs import make_programs, make_state
-from foajax.rollout import Collector
+from foajax.rollout import Collector, update_on
 from foajax.train import make_environments
 
 # Small networks and short rollouts: most of the time goes into compiling them.
@@ -41,13 +41,8 @@ class Loop:
         scores = []
         for _ in range(count):
             rollouts, outcomes = self.collect()
-            for epoch in range(self.config.learner.epochs):
-                for rollout in rollouts:
-                    for index in range(self.config.learner.minibatches // len(rollouts)):
-                        self.state, row = self.programs.update(
-                            self.state, rollout, np.int32(index), np.bool_(epoch == 0)
-                        )
-                        self.metrics.append(row)
+            self.state, metrics = update_on(rollouts, self.state, self.programs, self.config.learner)
+            self.metrics += metrics
             scores.append(np.mean([outcome.score for group in outcomes for outcome in group]))
         return np.mean(scores[-max(1, count // 10) :])
 

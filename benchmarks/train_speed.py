@@ -1,0 +1,230 @@
+"""How fast does training run, against the emulator alone?
+
+    python benchmarks/train_speed.py [experiments=constant70_packed,nonfoa] [torso=a3c] [num_envs=32] [out=<file>] ...
+
+For each experiment, in a process of its own: the environments alone under random actions, `act` alone, `update`
+alone, and the training loop, in turns of a few seconds, `repeats` times over. Printed and written are medians of
+steps/s; `ratio` is the median of end to end / env-only, each of one turn, so that both saw the same machine.
+`core_us` is processor time a step, summed over all cores. Further words (`learner.epochs=2`) go to the
+configuration. Run it on an idle machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from foajax import cli
+from foajax.agent import Agent
+from foajax.compose import compose
+from foajax.config import Config, ConfigError
+from foajax.programs import make_programs, make_state
+from foajax.rollout import Collector, update_on
+from foajax.train import make_environments, use_compilation_cache
+
+PARTS = ("env_only", "act_only", "update_only", "end_to_end")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes beside keys of the configuration."""
+
+    experiments: str = "nonfoa,constant70,constant70_packed,constant70_p_packed,decreasing_packed,logpolar"
+    torso: str = "nature"  # of the group network/
+    num_envs: int = 32
+    repeats: int = 5
+    seconds: float = 3.0  # a turn of one part
+    startup: bool = True  # also time a whole process up to its first update
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("num_envs", "repeats"):
+            if getattr(self, key) < 1:
+                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
+        if self.seconds <= 0:
+            raise ConfigError(f"seconds={self.seconds}: accepted is a number > 0")
+        if self.out and not Path(self.out).absolute().parent.is_dir():
+            raise ConfigError(f"out={self.out}: accepted is a file in a directory that exists")
+
+
+class Bench:
+    """One experiment's parts, each a call that makes `steps` steps and returns when they are done."""
+
+    def __init__(self, config: Config, resources: contextlib.ExitStack) -> None:
+        self._learner = config.learner
+        self._environments = make_environments(config, 0)
+        alone = make_environments(config, 1)
+        for environment in [*self._environments, *alone]:
+            resources.callback(environment.close)
+        agent = Agent(config, self._environments[0].num_actions, self._environments[0].crop_top)
+        self._programs = make_programs(agent)
+        self._collector = Collector(agent, self._programs, self._environments, seed=config.seed)
+        self._state = make_state(agent, config.seed)
+        self._alone = Alone(alone, config.learner.rollout_length)
+        self._step = 0
+        self._metrics: list = []
+        self.steps = config.env.num_envs * config.learner.rollout_length
+
+    def env_only(self) -> None:
+        """The environments under random actions, and nothing else."""
+        self._alone.rollout()
+
+    def act_only(self) -> None:
+        """A rollout's decisions, all on the time step that is there."""
+        self._collector.decide(self._state, self._step)
+
+    def update_only(self) -> None:
+        """All updates on a rollout."""
+        rollouts = [group.rollout for group in self._collector.groups]
+        self._state, metrics = update_on(rollouts, self._state, self._programs, self._learner)
+        jax.block_until_ready(metrics)
+
+    def end_to_end(self) -> None:
+        """A rollout and its updates, as training has them: not waited for before the next one."""
+        rollouts, _ = self._collector.collect(self._state, self._step)
+        jax.device_get(self._metrics)
+        self._state, self._metrics = update_on(rollouts, self._state, self._programs, self._learner)
+        self._step += self._learner.rollout_length
+
+
+class Alone:
+    """Groups of environments that step as in training, each sent on as soon as it is received."""
+
+    def __init__(self, environments: Sequence[Any], length: int) -> None:
+        self._environments, self._length = environments, length
+        random = np.random.default_rng(0)
+        self._actions = [random.integers(0, e.num_actions, (64, e.num_envs)).astype(np.int32) for e in environments]
+        self._step = 0
+        for environment, actions in zip(environments, self._actions, strict=True):
+            environment.reset()
+            environment.send(actions[0])
+
+    def rollout(self) -> None:
+        """`length` steps of every group."""
+        for _ in range(self._length):
+            self._step += 1
+            for environment, actions in zip(self._environments, self._actions, strict=True):
+                environment.recv()
+                environment.send(actions[self._step % 64])
+
+
+def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
+    """One experiment's record."""
+    use_compilation_cache()
+    config = compose(words)
+    with contextlib.ExitStack() as resources:
+        bench = Bench(config, resources)
+        calls = {part: getattr(bench, part) for part in PARTS}
+        for call in reversed(calls.values()):  # compiles; the loop first, so that there is a rollout to learn from
+            call()
+        turns: dict[str, list[tuple[float, float]]] = {part: [] for part in PARTS}
+        for _ in range(options.repeats):
+            for part, call in calls.items():
+                turns[part].append(_turn(call, bench.steps, options.seconds))
+    record: dict[str, Any] = {
+        "experiment": config.name,
+        "torso": config.network.torso,
+        "num_envs": config.env.num_envs,
+        "groups": config.env.groups,
+    }
+    record |= {part: statistics.median(speed for speed, _ in turns[part]) for part in PARTS}
+    ratios = [whole / env for (whole, _), (env, _) in zip(turns["end_to_end"], turns["env_only"], strict=True)]
+    record |= {"ratio": statistics.median(ratios), "ratio_min": min(ratios), "ratio_max": max(ratios)}
+    record["core_us"] = {part: statistics.median(core for _, core in turns[part]) for part in PARTS}
+    record["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return record
+
+
+def _turn(call: Callable[[], None], steps: int, seconds: float) -> tuple[float, float]:
+    """Steps/s, and microseconds of processor time a step."""
+    count, begin, busy = 0, time.perf_counter(), time.process_time()
+    while (taken := time.perf_counter() - begin) < seconds or count == 0:
+        call()
+        count += 1
+    return count * steps / taken, 1e6 * (time.process_time() - busy) / (count * steps)
+
+
+def startup(words: Sequence[str], config: Config) -> float:
+    """Seconds of a whole training process of one rollout, its updates and a checkpoint; compiled before."""
+    steps = config.env.num_envs * config.learner.rollout_length
+    seconds = 0.0
+    for _ in range(2):  # the first one fills the compilation cache
+        with tempfile.TemporaryDirectory() as directory:
+            words_of_run = [*words, f"train.env_steps={steps}", f"run={directory}/run"]
+            begin = time.perf_counter()
+            subprocess.run([sys.executable, "-m", "foajax.train", *words_of_run], check=True, stdout=subprocess.DEVNULL)
+            seconds = time.perf_counter() - begin
+    return seconds
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Measures every experiment, prints the table, writes JSON."""
+    keys = {field.name for field in dataclasses.fields(Options)}
+    options = cli.parse(Options, [word for word in arguments if word.partition("=")[0] in keys])
+    more = [word for word in arguments if word.partition("=")[0] not in keys]
+    device = {
+        "device": jax.devices()[0].device_kind,
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        **{package: version(package) for package in ("jax", "jaxlib", "flax", "envpool", "numpy")},
+    }
+    print("  ".join(f"{key} {value}" for key, value in device.items()), flush=True)
+    records = []
+    for name in options.experiments.split(","):
+        words = [f"experiment={name}", f"network={options.torso}", f"env.num_envs={options.num_envs}", *more]
+        config = compose(words)
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            record = pool.apply(measure, (words, options))
+        if options.startup:
+            record["startup_seconds"] = startup(words, config)
+        records.append(record | device)
+        print(_line(record), flush=True)
+    _print(records)
+    if options.out:
+        Path(options.out).write_text(json.dumps(records, indent=1) + "\n")
+
+
+def _line(record: dict[str, Any]) -> str:
+    speeds = "  ".join(f"{part} {record[part]:,.0f}" for part in PARTS)
+    return f"  {record['experiment']:22} {speeds}  ratio {record['ratio']:.2f}"
+
+
+def _print(records: Sequence[dict[str, Any]]) -> None:
+    table = Table(title="steps/s (core microseconds a step)")
+    for heading in ("experiment", "torso", "envs", *PARTS, "ratio (min-max)", "MB", "start s"):
+        table.add_column(heading, justify="left" if heading in ("experiment", "torso") else "right")
+    for record in records:
+        table.add_row(
+            record["experiment"],
+            record["torso"],
+            str(record["num_envs"]),
+            *(f"{record[part]:,.0f} ({record['core_us'][part]:,.0f})" for part in PARTS),
+            f"{record['ratio']:.2f} ({record['ratio_min']:.2f}-{record['ratio_max']:.2f})",
+            f"{record['peak_memory_mb']:,.0f}",
+            f"{record['startup_seconds']:.1f}" if "startup_seconds" in record else "",
+        )
+    Console(width=150).print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))
