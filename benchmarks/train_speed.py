@@ -35,6 +35,7 @@ from rich.table import Table
 
 from foajax import cli
 from foajax.agent import Agent
+from foajax.allocator import keep_memory
 from foajax.compose import compose
 from foajax.config import Config, ConfigError
 from foajax.programs import make_programs, make_state
@@ -130,6 +131,7 @@ class Alone:
 def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
     """One experiment's record."""
     use_compilation_cache()
+    keep_memory()
     config = compose(words)
     with contextlib.ExitStack() as resources:
         bench = Bench(config, resources)

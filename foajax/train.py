@@ -15,6 +15,7 @@ import numpy as np
 
 from foajax import compose, envs, profiling
 from foajax.agent import Agent
+from foajax.allocator import keep_memory
 from foajax.checkpoint import Checkpoints
 from foajax.config import Config, ConfigError
 from foajax.learner import Metrics
@@ -187,6 +188,7 @@ def use_compilation_cache() -> None:
 def train(config: Config) -> None:
     """One run from its newest checkpoint, or from nothing, to `train.env_steps`; or a profile of it."""
     use_compilation_cache()
+    keep_memory()
     with contextlib.ExitStack() as resources:
         if config.profile:
             environments = make_environments(config, 0)

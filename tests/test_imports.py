@@ -36,6 +36,7 @@ CORE = [
 PARTS = 1  # the row of the pure parts
 # The outside world knows types, config and itself, never the core.
 WORLD = {
+    "allocator",
     "checkpoint",
     "cli",
     "compose",
