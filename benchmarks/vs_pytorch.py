@@ -1,0 +1,261 @@
+"""The network against the same one in PyTorch: forward, and forward and backward, at the learner's shapes.
+
+    python benchmarks/vs_pytorch.py [experiments=nonfoa,constant70_packed] [torso=nature] [num_envs=4] [out=<file>]
+
+Torso, dense layer, LSTM over T+1 = 21 steps (reset where episodes start) and the heads, on the same random images,
+with the same parameters (the outputs are compared first); `update` is the whole step: A2C loss of both heads, its
+gradient, clipping and Adam with AMSGrad. Both sides run in this process, in turns, with all its cores. Speeds are
+medians, in steps/s. Needs PyTorch (`pip install torch`), which foajax itself does not use. Run it on an idle machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from foajax import cli
+from foajax.agent import Agent
+from foajax.allocator import keep_memory
+from foajax.compose import compose
+from foajax.config import ConfigError
+from foajax.foveation import image_shapes
+from foajax.optimizer import make_optimizer
+from foajax.types import CoreState, NetworkOutput
+
+STEPS = 21  # T + 1
+ACTIONS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    experiments: str = "nonfoa,constant70_packed"
+    torso: str = "nature"  # of the group network/
+    num_envs: int = 4  # of a minibatch
+    repeats: int = 40
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("num_envs", "repeats"):
+            if getattr(self, key) < 1:
+                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
+
+
+def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
+    """The network of `foajax.networks` in PyTorch's own operations, and its parameters as leaves."""
+    import torch
+    import torch.nn.functional as F
+
+    leaves: list = []
+
+    def leaf(array: Any, *order: int) -> Any:
+        tensor = torch.tensor(np.asarray(array).transpose(order or range(np.ndim(array))))
+        leaves.append(tensor.contiguous().requires_grad_())
+        return leaves[-1]
+
+    def linear(own: dict) -> Any:
+        weight, bias = leaf(own["kernel"], 1, 0), leaf(own["bias"])
+        return lambda x: F.linear(x, weight, bias)
+
+    def convolutions(own: dict) -> Any:
+        layers = [(leaf(c["kernel"], 3, 2, 0, 1), leaf(c["bias"])) for _, c in sorted(own.items())]
+
+        def nature(x: Any) -> Any:
+            strides = (layers[0][0].shape[-1] // 2, 2, 1)
+            for (weight, bias), stride in zip(layers, strides, strict=False):
+                x = F.relu(F.conv2d(x, weight, bias, stride=stride))
+            return x
+
+        def a3c(x: Any) -> Any:
+            for (weight, bias), border in zip(layers, (2, 1, 1, 1), strict=False):
+                x = F.conv2d(x, weight, bias, padding=border)
+                x = F.relu(F.max_pool2d(x, 2) if min(x.shape[2:]) > 4 else x)
+            return x
+
+        run = nature if torso == "nature" else a3c
+        return lambda x: run(x).permute(0, 2, 3, 1).flatten(1)  # features in the order of foajax's
+
+    torsos = {int(name[6:]): convolutions(own) for name, own in params.items() if name.startswith("torso_")}
+    dense = linear(params["dense"]) if "dense" in params else None
+    project = linear(params["lstm_input"])
+    recurrent = leaf(params["lstm_recurrent"], 1, 0)
+    heads = [
+        linear(params[n]) for n in ("natural_policy", "natural_value", "vision_policy", "vision_value") if n in params
+    ]
+
+    def forward(images: Sequence[Any], focal_point: Any | None, keep: Any, state: tuple) -> list:
+        parts = [torsos[i](x) if i in torsos else x.permute(0, 2, 3, 1).flatten(1) for i, x in enumerate(images)]
+        features = torch.cat(parts, 1)
+        features = F.relu(dense(features)) if dense else features
+        if focal_point is not None:
+            features = torch.cat([features, focal_point], 1)
+        gates = project(features).reshape(*keep.shape[:2], -1)
+        cell, hidden = state
+        outputs = []
+        for t in range(keep.shape[0]):
+            cell, hidden = cell * keep[t], hidden * keep[t]
+            i, f, g, o = (gates[t] + F.linear(hidden, recurrent)).chunk(4, -1)
+            cell = torch.sigmoid(f) * cell + torch.sigmoid(i) * torch.tanh(g)
+            hidden = torch.sigmoid(o) * torch.tanh(cell)
+            outputs.append(hidden)
+        stacked = torch.stack(outputs)
+        return [head(stacked) for head in heads]
+
+    return forward, leaves
+
+
+def flat_loss(outputs: Sequence[Any], log_softmax: Callable, actions: Callable) -> Any:
+    """An actor-critic loss of the right cost: log-probability, value error and entropy of each head."""
+    total = 0.0
+    for logits, value in zip(outputs[0::2], outputs[1::2], strict=True):
+        log_p = log_softmax(logits)
+        total = total + (0.5 * value**2 - log_p[..., :1]).mean() + 0.01 * (actions(log_p) * log_p).sum(-1).mean()
+    return total
+
+
+def measure(name: str, options: Options) -> dict[str, Any]:
+    """One experiment on both sides."""
+    import torch
+
+    config = compose([f"experiment={name}", f"network={options.torso}"])
+    agent = Agent(config, ACTIONS, None)
+    params = agent.initial_params(jax.random.key(0))
+    random = np.random.default_rng(0)
+    batch = options.num_envs
+    shapes = image_shapes(config.sensor, config.env.frame_shape)
+    roi = [random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in shapes]
+    unit = random.uniform(-1, 1, (STEPS, batch, 2)).astype(np.float32)
+    is_first = random.random((STEPS, batch)) < 0.02
+    width = config.network.lstm
+
+    inputs = ([jnp.asarray(x) for x in roi], jnp.asarray(unit), jnp.asarray(is_first))
+    zeros = jnp.zeros((batch, width))
+    optimizer = make_optimizer(config.learner, 1)
+
+    def apply(params: Any) -> list:
+        output = agent.forward(params, *inputs, CoreState(cell=zeros, hidden=zeros))[0]
+        return [x if x.ndim == 3 else x[..., None] for x in NetworkOutput(*output) if x is not None]
+
+    def loss(params: Any) -> Any:
+        return flat_loss(apply(params), jax.nn.log_softmax, jnp.exp)
+
+    def step(params: Any, state: Any) -> Any:
+        change, state = optimizer.update(jax.grad(loss)(params), state, params)
+        return jax.tree.map(jnp.add, params, change), state
+
+    ours = {"forward": jax.jit(apply), "forward_backward": jax.jit(jax.grad(loss))}
+    update = jax.jit(step, donate_argnums=(0, 1))
+    training = [jax.tree.map(jnp.copy, params), optimizer.init(params)]
+
+    def our_update() -> None:
+        training[:] = update(*training)
+        jax.block_until_ready(training)
+
+    forward, leaves = torch_network(params["params"], options.torso)
+    images = [torch.tensor(x.reshape(-1, *x.shape[2:]).transpose(0, 3, 1, 2)).contiguous() for x in roi]
+    point = torch.tensor(unit.reshape(-1, 2)) if agent.network.sees_focal_point else None
+    keep = torch.tensor(1.0 - is_first[..., None].astype(np.float32))
+    state = (torch.zeros(batch, width), torch.zeros(batch, width))
+    adam = torch.optim.Adam(leaves, lr=config.learner.learning_rate, eps=config.learner.adam_eps, amsgrad=True)
+
+    def their_loss() -> Any:
+        return flat_loss(forward(images, point, keep, state), lambda x: torch.log_softmax(x, -1), torch.exp)
+
+    def their_forward() -> list:
+        with torch.no_grad():
+            return forward(images, point, keep, state)
+
+    def their_gradient() -> None:
+        adam.zero_grad()
+        their_loss().backward()
+
+    def their_update() -> None:
+        their_gradient()
+        torch.nn.utils.clip_grad_norm_(leaves, config.learner.max_grad_norm or 1e9)
+        adam.step()
+
+    for mine, other in zip(ours["forward"](params), their_forward(), strict=True):
+        np.testing.assert_allclose(mine, other.numpy(), atol=2e-4)
+    gradient = jax.tree.leaves(ours["forward_backward"](params))
+    their_gradient()
+    norms = [
+        float(np.sqrt(sum((np.asarray(g) ** 2).sum() for g in side))) for side in (gradient, [x.grad for x in leaves])
+    ]
+    np.testing.assert_allclose(*norms, rtol=1e-3)
+
+    calls: dict[str, tuple[Callable, Callable]] = {
+        "forward": (lambda: jax.block_until_ready(ours["forward"](params)), their_forward),
+        "forward_backward": (lambda: jax.block_until_ready(ours["forward_backward"](params)), their_gradient),
+        "update": (our_update, their_update),
+    }
+    record: dict[str, Any] = {"experiment": name, "torso": options.torso, "num_envs": batch, "steps": STEPS - 1}
+    for part, pair in calls.items():
+        mine, other = _medians(pair, options.repeats)
+        steps = (STEPS - 1) * batch
+        record[part] = {"foajax": steps / mine, "pytorch": steps / other, "ratio": other / mine}
+    return record
+
+
+def _medians(calls: Sequence[Callable], repeats: int) -> list[float]:
+    """Seconds, called in turns of five; each side's threads have time to fall asleep in between."""
+    times: list[list[float]] = [[] for _ in calls]
+    for turn in range(repeats // 5 + 1):
+        for call, taken in zip(calls, times, strict=True):
+            call()
+            for _ in range(5):
+                begin = time.perf_counter()
+                call()
+                if turn:
+                    taken.append(time.perf_counter() - begin)
+    return [statistics.median(taken) for taken in times]
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Measures every experiment, prints a line each, writes JSON."""
+    options = cli.parse(Options, arguments)
+    try:
+        import torch
+    except ImportError:
+        print("left out: PyTorch is not installed")
+        return
+    keep_memory()
+    device = {
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": version("jax"),
+        "torch": torch.__version__,
+        "torch_threads": torch.get_num_threads(),
+    }
+    print("  ".join(f"{key} {value}" for key, value in device.items()))
+    records = []
+    for name in options.experiments.split(","):
+        record = measure(name, options)
+        records.append(record | device)
+        for part in ("forward", "forward_backward", "update"):
+            speeds = record[part]
+            print(
+                f"  {name:20} {part:17} foajax {speeds['foajax']:8,.0f}  PyTorch {speeds['pytorch']:8,.0f} steps/s"
+                f"  ratio {speeds['ratio']:.2f}",
+                flush=True,
+            )
+    if options.out:
+        Path(options.out).write_text(json.dumps(records, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))
