@@ -73,9 +73,10 @@ def test_both_gradients_of_the_fast_form_are_the_plain_ones(image, kernel, strid
         np.testing.assert_allclose(fast, plain, rtol=1e-4, atol=1e-4)
 
 
-def test_backend_chooses_the_form(monkeypatch):
-    x, w = arrays((2, 8, 8, 6), (3, 3, 6, 7))
+def test_backend_and_batch_choose_the_form(monkeypatch):
+    x, w = arrays((8, 8, 8, 6), (3, 3, 6, 7))
     assert "conv_general_dilated" not in str(jax.make_jaxpr(lambda x, w: convolve(x, w))(x, w))
+    assert "conv_general_dilated" in str(jax.make_jaxpr(lambda x, w: convolve(x, w))(x[:1], w))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert "conv_general_dilated" in str(jax.make_jaxpr(lambda x, w: convolve(x, w))(x, w))
 
