@@ -128,6 +128,7 @@ class EnvConfig:
     sticky_actions: float = 0.0  # probability that the emulator repeats the last action
     max_episode_steps: int = 27_000  # agent steps
     threads: int = 0  # of the engine; 0 lets it choose
+    timeout: float = 120.0  # seconds that a step may take before the engine is taken for hung
 
     def __post_init__(self) -> None:
         _check(self.num_envs >= 1, "env.num_envs", self.num_envs, "an integer >= 1")
@@ -141,6 +142,7 @@ class EnvConfig:
         _check(0 <= self.sticky_actions < 1, "env.sticky_actions", self.sticky_actions, "a probability in [0, 1)")
         _check(self.max_episode_steps >= 1, "env.max_episode_steps", self.max_episode_steps, "an integer >= 1")
         _check(self.threads >= 0, "env.threads", self.threads, "an integer >= 0")
+        _check(self.timeout > 0, "env.timeout", self.timeout, "seconds > 0")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,6 +219,7 @@ class TrainConfig:
     checkpoint_every: float = 60.0  # seconds
     keep: int = 3  # newest checkpoints kept
     max_skipped: int = 20  # updates in a row that may be skipped as not finite before the run stops
+    dump_skipped: bool = False  # keep the batches that such rows begin with, in <run>/skipped
 
     def __post_init__(self) -> None:
         _check(self.env_steps >= 1, "train.env_steps", self.env_steps, "an integer >= 1")

@@ -42,8 +42,9 @@ _PACKAGES = (
 )
 # What may change between two starts of a run: none of it changes what a step learns.
 _FREE = {
-    *("run", "profile", "env.threads"),
-    *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep", "train.max_skipped"),
+    *("run", "profile", "env.threads", "env.timeout"),
+    *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep"),
+    *("train.max_skipped", "train.dump_skipped"),
 }
 
 

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from types import FrameType
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from foajax.rollout import Collector, update_on
 from foajax.rundir import RunDir, open_run
 from foajax.store import CHECKPOINTS, save_facts
 from foajax.types import Outcome
+from foajax.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 
 _GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best
 
@@ -34,7 +36,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.name: str | None = None
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+        for number in STOPS:
             signal.signal(number, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
@@ -51,9 +53,14 @@ class Run:
         self._say = lambda text: print(text, file=sys.stderr, flush=True)  # until there is a logger
         self._rollout_steps = config.env.num_envs * config.learner.rollout_length
         self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=config.train.keep, warn=self._warn)
+        self._env_steps = max(self._checkpoints.steps(), default=0)
+        self._games: list[dict[str, Any]] | None = None  # as they were after the last update
+        watchdog = Watchdog(config.env.timeout, abandon=self._abandon, is_saved=self._is_saved)
+        resources.enter_context(watchdog)
         # Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it got.
-        environments = make_environments(config, max(self._checkpoints.steps(), default=0))
-        for environment in environments:
+        environments = watchdog.watched("making the environments", make_environments)(config, self._env_steps)
+        for group, environment in enumerate(environments):
+            watchdog.watch(environment, f"environment group {group}")
             resources.callback(environment.close)
         agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
         save_facts(agent, run_dir.path)
@@ -79,9 +86,8 @@ class Run:
         try:
             self._loop(stop)
         finally:
-            self._checkpoints.wait()
-            self._save()
-        self._say(self._how_it_ends(stop))
+            self._finish()
+        self._say(self._how_it_ends(stop.name))
 
     def _loop(self, stop: StopRequest) -> None:
         train = self._config.train
@@ -99,6 +105,7 @@ class Run:
             self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
             self._track(outcomes)
             self._env_steps += self._rollout_steps
+            self._games = self._collector.get_state()
             if now - saved >= train.checkpoint_every:
                 self._save()
                 saved = now
@@ -140,16 +147,40 @@ class Run:
 
     def _restore(self) -> int:
         """Takes over the newest good checkpoint; returns its env_steps."""
+        self._games = self._collector.get_state()
         restored = self._checkpoints.restore(self._everything())
         if restored is None:
             return 0
         self._state = restored.state["train"]
         self._collector.set_state(restored.state["collector"])
+        self._games = restored.state["collector"]
         self._tracker.set_state(restored.meta["tracker"], same_games=self._collector.resumable)
         return restored.env_steps
 
     def _everything(self) -> dict[str, Any]:
-        return {"train": self._state, "collector": self._collector.get_state()}
+        return {"train": self._state, "collector": self._games}
+
+    def _is_saved(self) -> bool:
+        return self._env_steps == max(self._checkpoints.steps(), default=0)
+
+    def _finish(self) -> None:
+        """Saves what the last update left, before the process ends, and waits for it."""
+        if self._games is None:
+            return
+        try:
+            self._checkpoints.wait()
+            self._save()
+            self._checkpoints.wait()
+        except RuntimeError as error:  # a failed update has taken the arrays with it
+            self._warn(f"nothing newer can be saved: {str(error).partition(chr(10))[0]}")
+
+    def _abandon(self, why: str, code: int) -> None:
+        """The watchdog's last words: the main thread does not come back."""
+        self._finish()
+        if code:
+            report_fault(self._config, why, None)
+        else:
+            self._say(self._how_it_ends(why))
 
     def _how_it_starts(self) -> str:
         if not self._env_steps:
@@ -157,10 +188,10 @@ class Run:
         games = "episodes go on" if self._collector.resumable else "episodes start anew, emulators cannot be saved"
         return f"resumed at {self._env_steps:,} env_steps ({games})"
 
-    def _how_it_ends(self, stop: StopRequest) -> str:
-        if stop.name is None:
+    def _how_it_ends(self, stop: str | None) -> str:
+        if stop is None:
             return f"done: {self._env_steps:,} env_steps"
-        return f"{stop.name}: saved at {self._env_steps:,} env_steps; the same command goes on from here"
+        return f"{stop}: saved at {self._env_steps:,} env_steps; the same command goes on from here"
 
     def _warn(self, text: str) -> None:
         self._say(f"warning: {text}")
@@ -185,10 +216,31 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_compilation_cache_dir", os.path.join(cache, "foajax"))
 
 
-def train(config: Config) -> None:
-    """One run from its newest checkpoint, or from nothing, to `train.env_steps`; or a profile of it."""
+def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:
+    """One line on stderr about an environment that raised or hung; returns the exit code."""
+    run_dir = Path(config.run_dir)
+    steps = Checkpoints(run_dir / CHECKPOINTS, keep=None).steps()
+    saved = f"saved at {steps[-1]:,} env_steps, the same command goes on from there" if steps else "nothing to save yet"
+    line = f"game={config.game}: {what}; {saved}; details in {record(run_dir, error)}"
+    print(f"foajax: error: {line}", file=sys.stderr, flush=True)
+    return FAULT
+
+
+def train(config: Config) -> int:
+    """One run from its newest checkpoint, or from nothing, to `train.env_steps`; or a profile of it.
+
+    Returns the exit code: 0 where the run is done or has been asked to stop, `FAULT` where an environment failed.
+    """
     use_compilation_cache()
     keep_memory()
+    try:
+        _train(config)
+    except EnvironmentFault as fault:
+        return report_fault(config, str(fault), fault)
+    return 0
+
+
+def _train(config: Config) -> None:
     with contextlib.ExitStack() as resources:
         if config.profile:
             environments = make_environments(config, 0)
