@@ -156,15 +156,17 @@ def update(
 ) -> tuple[TrainState, Metrics]:
     """One optimiser step on minibatch `index` of a rollout.
 
-    Where the loss or the gradient is not finite, parameters and optimiser stay as they were and the step is
-    counted as skipped. Frames enter the running statistics on the first pass over a rollout only.
+    Where the loss, the gradient or a new parameter is not finite, parameters and optimiser stay as they were and
+    the step is counted as skipped. Frames enter the running statistics on the first pass over a rollout only.
     """
     part = minibatch(rollout, index, size)
     gradient, metrics = jax.grad(loss, has_aux=True)(state.params, agent, part)
     grad_norm = optax.tree.norm(gradient)
-    finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
-    updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
-    params = optax.apply_updates(state.params, updates)
+    change, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+    params = optax.apply_updates(state.params, change)
+    param_norm = optax.tree.norm(params)
+    finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm) & jnp.isfinite(param_norm)
+    most = agent.config.learner.max_grad_norm
     params, opt_state = jax.tree.map(
         lambda new, old: jnp.where(finite, new, old), (params, opt_state), (state.params, state.opt_state)
     )
@@ -176,13 +178,14 @@ def update(
         jnp.broadcast_to(is_first_pass, steps.frame_mean[:-1].size),
     )
     skipped = jnp.where(finite, 0, state.skipped + 1)
+    updates = state.updates + 1
     metrics |= {
         "grad_norm": grad_norm,
-        "param_norm": optax.tree.norm(params),
+        "param_norm": param_norm,
+        "clipped": (finite & (grad_norm > (jnp.inf if most is None else most))).astype(jnp.float32),
         "skipped": 1.0 - finite.astype(jnp.float32),
         "skipped_in_a_row": skipped,
+        "skipped_updates": updates - opt_state.count,
     }
-    state = TrainState(
-        params=params, opt_state=opt_state, statistics=statistics, updates=state.updates + 1, skipped=skipped
-    )
+    state = TrainState(params=params, opt_state=opt_state, statistics=statistics, updates=updates, skipped=skipped)
     return state, metrics

@@ -258,6 +258,7 @@ class EpisodeTracker:
 
     def __init__(self, num_envs: int, *, window: int = 100) -> None:
         self.games = 0  # finished so far
+        self.best_score = math.nan  # highest `mean_score` of a full window; NaN before the first
         self._recent: deque[tuple[float, int]] = deque(maxlen=window)
         self._scores = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, int)
@@ -272,6 +273,8 @@ class EpisodeTracker:
         self._lengths[over] = -1  # the reset comes next
         self.games += len(finished)
         self._recent.extend(finished)
+        if finished and len(self._recent) == self._recent.maxlen:
+            self.best_score = float(np.fmax(self.best_score, self.mean_score))
         return finished
 
     @property
@@ -288,6 +291,7 @@ class EpisodeTracker:
         """All of it, as JSON has it."""
         return {
             "games": self.games,
+            "best_score": None if math.isnan(self.best_score) else self.best_score,
             "recent": [list(game) for game in self._recent],
             "scores": self._scores.tolist(),
             "lengths": self._lengths.tolist(),
@@ -296,6 +300,8 @@ class EpisodeTracker:
     def set_state(self, state: Mapping[str, Any], *, same_games: bool) -> None:
         """Takes over a saved state; the unfinished games only where the environments go on with them."""
         self.games = int(state["games"])
+        best = state.get("best_score")
+        self.best_score = math.nan if best is None else float(best)
         self._recent.clear()
         self._recent.extend((float(score), int(length)) for score, length in state["recent"])
         if same_games:

@@ -70,7 +70,7 @@ def load_agent(path: str | Path) -> Stored:
 def save_agent(stored: Stored, directory: Path) -> None:
     """Writes a shipped agent: float32 arrays by name, the configuration and the facts."""
     directory.mkdir(parents=True, exist_ok=True)
-    arrays = _named((stored.params, stored.statistics))
+    arrays = named((stored.params, stored.statistics))
     save_file(arrays, directory / _PARAMETERS)
     config = to_mapping(stored.agent.config)
     (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
@@ -84,7 +84,7 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
         arrays = load_file(file)
     except (OSError, SafetensorError) as error:
         raise ConfigError(f"run={file.parent}: {file.name} is not readable: {str(error).splitlines()[0]}") from None
-    names = _named(wanted)
+    names = named(wanted)
     if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
         raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
     leaves = [arrays[name] for name in names]
@@ -92,7 +92,7 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
     return Stored(agent, params, statistics, env_steps)
 
 
-def _named(tree) -> dict:
+def named(tree) -> dict:
     """Leaves by their path, e.g. `0/params/dense/kernel`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import sys
 import time
-from types import FrameType
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from foajax.agent import Agent
 from foajax.allocator import keep_memory
 from foajax.checkpoint import Checkpoints
 from foajax.config import Config, ConfigError
+from foajax.dump import Dump
 from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state
@@ -68,7 +70,12 @@ class Run:
         self._collector = Collector(agent, self._programs, environments, seed=config.seed)
         self._tracker = EpisodeTracker(config.env.num_envs)
         self._state = make_state(agent, config.seed)
-        self._env_steps = self._restore()
+        self._dump = (
+            Dump(run_dir.path / "skipped", minibatches=config.learner.minibatches, warn=self._warn)
+            if config.train.dump_skipped
+            else None
+        )
+        self._restore()
         self._logger = resources.enter_context(
             Logger(
                 run_dir.path,
@@ -102,6 +109,8 @@ class Run:
             if metrics and now - logged >= train.log_every:
                 self._log(metrics)
                 logged = now
+            if self._dump:
+                self._dump.remember(self._env_steps, self._state.params, rollouts)
             self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
             self._track(outcomes)
             self._env_steps += self._rollout_steps
@@ -115,11 +124,17 @@ class Run:
 
     def _check(self, metrics: list[Metrics]) -> None:
         """Stops a run whose updates are not finite time after time."""
-        if metrics and int(metrics[-1]["skipped_in_a_row"]) >= self._config.train.max_skipped:
+        if not metrics:
+            return
+        if self._dump:
+            self._dump.look(metrics)
+        last, most = metrics[-1], self._config.train.max_skipped
+        if int(last["skipped_in_a_row"]) >= most:
+            values = ", ".join(f"{name} {float(last[name]):.4g}" for name in ("loss", "grad_norm", "param_norm"))
             raise ConfigError(
-                f"train.max_skipped={self._config.train.max_skipped}: so many updates in a row were not finite; "
-                f"the last good parameters are kept at {self._env_steps} env_steps; "
-                "accepted is what a smaller learner.learning_rate or learner.max_grad_norm may give"
+                f"train.max_skipped={most}: so many updates in a row were not finite ({values}); the last good "
+                f"parameters are saved at {self._env_steps:,} env_steps; accepted is another run=<dir>, with a "
+                "smaller learner.learning_rate or learner.max_grad_norm"
             )
 
     def _track(self, outcomes: list[list[Outcome]]) -> None:
@@ -128,14 +143,16 @@ class Run:
 
     def _log(self, metrics: list[Metrics]) -> None:
         rows = jax.device_get(metrics)
-        means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0] if name != "skipped_in_a_row"}
+        means = {name: finite_mean([row[name] for row in rows]) for name in rows[0] if name != "skipped_in_a_row"}
         self._logger.write(
             {
                 "env_steps": self._env_steps,
                 "games": self._tracker.games,
                 "score": self._tracker.mean_score,
                 "length": self._tracker.mean_length,
+                "best_score": self._tracker.best_score,
                 **means,
+                "skipped_updates": rows[-1]["skipped_updates"],
             }
         )
 
@@ -143,22 +160,19 @@ class Run:
         meta: dict[str, Any] = {"tracker": self._tracker.get_state()}
         if self._tracker.games >= _GAMES_FOR_A_SCORE:
             meta["score"] = self._tracker.mean_score
-        self._checkpoints.save(self._env_steps, self._everything(), meta)
+        self._checkpoints.save(self._env_steps, {"train": self._state, "collector": self._games}, meta)
 
-    def _restore(self) -> int:
-        """Takes over the newest good checkpoint; returns its env_steps."""
-        self._games = self._collector.get_state()
-        restored = self._checkpoints.restore(self._everything())
+    def _restore(self) -> None:
+        """Takes over the newest good checkpoint, if there is one."""
+        games = self._collector.get_state()
+        restored = self._checkpoints.restore({"train": self._state, "collector": games})
         if restored is None:
-            return 0
-        self._state = restored.state["train"]
-        self._collector.set_state(restored.state["collector"])
-        self._games = restored.state["collector"]
+            self._env_steps, self._games = 0, games
+            return
+        self._state, games = restored.state["train"], restored.state["collector"]
+        self._collector.set_state(games)
         self._tracker.set_state(restored.meta["tracker"], same_games=self._collector.resumable)
-        return restored.env_steps
-
-    def _everything(self) -> dict[str, Any]:
-        return {"train": self._state, "collector": self._games}
+        self._env_steps, self._games = restored.env_steps, games
 
     def _is_saved(self) -> bool:
         return self._env_steps == max(self._checkpoints.steps(), default=0)
@@ -195,6 +209,12 @@ class Run:
 
     def _warn(self, text: str) -> None:
         self._say(f"warning: {text}")
+
+
+def finite_mean(values: list[np.ndarray]) -> float:
+    """Of what is finite: one skipped update is not to hide the others'. NaN where nothing is."""
+    finite = [float(value) for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else math.nan
 
 
 def environment_seed(seed: int, env_steps: int, group: int) -> int:

@@ -50,9 +50,10 @@ WORLD = {
     "render",
     "rundir",
     "seek",
+    "watchdog",
 }
 # Where the two meet: the loop that acts, and the commands around a trained agent.
-MEETING = {"cost", "evaluate", "profiling", "report", "rollout", "show", "store", "train", "wrapper"}
+MEETING = {"cost", "dump", "evaluate", "profiling", "report", "rollout", "show", "store", "train", "wrapper"}
 
 # What only some may import, so that an engine or a library can be replaced in one place.
 ONLY_IN = {
@@ -64,6 +65,7 @@ ONLY_IN = {
     "orbax": {"checkpoint"},
     "hydra": {"compose"},
     "omegaconf": {"compose"},
+    "safetensors": {"dump", "store"},
     "tensorboardX": {"logger"},
 }
 

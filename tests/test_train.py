@@ -1,53 +1,15 @@
 """The command itself, in real processes: runs, resumes, survives being killed, refuses in one line."""
 
 import json
-import os
-import random
 import signal
-import subprocess
-import sys
 import time
 
 import jax
 import numpy as np
 import pytest
+from processes import TINY, finish, has_rows, rows, start, wait_for
 
 from foajax.store import load_agent, save_agent
-
-TINY = [
-    "sensor=rings",
-    "sensor.rings=[[16,16,2]]",
-    "sensor.layout=packed",
-    "network.dense=16",
-    "network.lstm=16",
-    "env.num_envs=8",
-    "learner.minibatches=2",
-    "learner.rollout_length=5",
-    "train.log_every=0.01",
-]
-
-
-def start(*arguments, module="train", **options):
-    command = [sys.executable, "-m", f"foajax.{module}", *arguments]
-    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
-
-
-def finish(*arguments, module="train"):
-    process = start(*arguments, module=module)
-    out, err = process.communicate(timeout=300)
-    return process.returncode, out, err
-
-
-def rows(run):
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-
-
-def wait_for(condition, process, timeout=200):
-    end = time.monotonic() + timeout
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +82,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
 def test_a_signal_saves_and_ends_well(tmp_path, number):
     process = start("game=seek", *TINY, f"run={tmp_path}", "train.env_steps=100000000")
-    wait_for(lambda: (tmp_path / "metrics.jsonl").exists() and rows_or_none(tmp_path), process)
+    wait_for(lambda: has_rows(tmp_path), process)
     process.send_signal(number)
     begin = time.monotonic()
     out, err = process.communicate(timeout=60)
@@ -129,50 +91,6 @@ def test_a_signal_saves_and_ends_well(tmp_path, number):
     saved = max(int(p.name) for p in (tmp_path / "checkpoints").iterdir())
     assert f"{signal.Signals(number).name}: saved at {saved:,} env_steps" in out
     assert rows(tmp_path)[-1]["env_steps"] == saved
-
-
-def rows_or_none(run):
-    try:
-        return rows(run)
-    except ValueError:
-        return None
-
-
-def killed_again_and_again(run, words, times, seed):
-    """SIGKILL at random moments; returns the env_steps of the newest checkpoint after each."""
-    rng = random.Random(seed)
-    reached = [0]
-    for _ in range(times):
-        process = start(*words, f"run={run}", "train.env_steps=100000000", "train.checkpoint_every=0.5")
-        before = reached[-1]
-        wait_for(lambda before=before: newest(run) > before, process)
-        time.sleep(rng.uniform(0, 2))
-        process.kill()
-        process.communicate()
-        for line in (run / "metrics.jsonl").read_text().splitlines()[:-1]:
-            json.loads(line)
-        reached.append(newest(run))
-    return reached
-
-
-def newest(run):
-    directory = run / "checkpoints"
-    return max((int(n) for n in os.listdir(directory) if n.isdigit()), default=0) if directory.exists() else 0
-
-
-def test_sigkill_costs_no_more_than_the_steps_since_the_last_checkpoint(tmp_path):
-    reached = killed_again_and_again(tmp_path, ["game=seek", *TINY], times=2, seed=0)
-    assert reached == sorted(reached) and reached[-1] > reached[1] > 0
-    code, out, err = finish("game=seek", *TINY, f"run={tmp_path}", f"train.env_steps={reached[-1]}")
-    assert code == 0, err
-    assert f"resumed at {reached[-1]:,} env_steps" in out
-    assert all(row["env_steps"] <= reached[-1] for row in rows(tmp_path))
-
-
-@pytest.mark.slow
-def test_ten_times_sigkill_on_breakout(tmp_path):
-    reached = killed_again_and_again(tmp_path, TINY, times=10, seed=1)
-    assert reached == sorted(reached) and len(set(reached)) == 11
 
 
 def test_two_processes_do_not_share_a_run(tmp_path):
