@@ -74,10 +74,11 @@ class LogPolarSensor:
     sampling: Literal["area", "bilinear"] = "area"
 
     def __post_init__(self) -> None:
-        _check(self.rings >= 2, "sensor.rings", self.rings, "an integer >= 2")
-        _check(self.wedges >= 4, "sensor.wedges", self.wedges, "an integer >= 4")
+        _check(2 <= self.rings <= 1000, "sensor.rings", self.rings, "an integer from 2 to 1000")
+        _check(4 <= self.wedges <= 1000, "sensor.wedges", self.wedges, "an integer from 4 to 1000")
         _check(self.fovea > 0, "sensor.fovea", self.fovea, "a radius > 0")
-        _check(self.radius > self.fovea, "sensor.radius", self.radius, f"a radius > sensor.fovea={self.fovea}")
+        radius = f"a radius > sensor.fovea={self.fovea} and <= 10000"
+        _check(self.fovea < self.radius <= 10_000, "sensor.radius", self.radius, radius)
 
     @property
     def window(self) -> tuple[int, int]:
@@ -101,7 +102,7 @@ class GazeConfig:
     path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn
 
     def __post_init__(self) -> None:
-        _check(self.step >= 1, "gaze.step", self.step, "an integer >= 1")
+        _check(1 <= self.step <= 10_000, "gaze.step", self.step, "an integer from 1 to 10000")
         if self.mode == "scripted":
             _check(len(self.path) > 0, "gaze.path", self.path, "at least one [y, x] where gaze.mode=scripted")
 
@@ -131,17 +132,20 @@ class EnvConfig:
     timeout: float = 120.0  # seconds that a step may take before the engine is taken for hung
 
     def __post_init__(self) -> None:
-        _check(self.num_envs >= 1, "env.num_envs", self.num_envs, "an integer >= 1")
+        _check(1 <= self.num_envs <= 100_000, "env.num_envs", self.num_envs, "an integer from 1 to 100000")
         _check(self.groups >= 1, "env.groups", self.groups, "an integer >= 1")
-        _check(min(self.frame_shape) >= 8, "env.frame_shape", self.frame_shape, "[height, width], each >= 8")
+        fits = 8 <= min(self.frame_shape) and max(self.frame_shape) <= 10_000
+        _check(fits, "env.frame_shape", self.frame_shape, "[height, width], each from 8 to 10000")
         _check("default" in self.crop_top, "env.crop_top", dict(self.crop_top), "a mapping with the key 'default'")
         for game, row in self.crop_top.items():
             _check(0 <= row <= 50, f"env.crop_top.{game}", row, "a screen row from 0 to 50 (160 rows are kept of 210)")
-        _check(self.frame_skip >= 1, "env.frame_skip", self.frame_skip, "an integer >= 1")
+        _check(1 <= self.frame_skip <= 1000, "env.frame_skip", self.frame_skip, "an integer from 1 to 1000")
         _check(0 <= self.noop_max <= 200, "env.noop_max", self.noop_max, "an integer from 0 to 200")
         _check(0 <= self.sticky_actions < 1, "env.sticky_actions", self.sticky_actions, "a probability in [0, 1)")
-        _check(self.max_episode_steps >= 1, "env.max_episode_steps", self.max_episode_steps, "an integer >= 1")
-        _check(self.threads >= 0, "env.threads", self.threads, "an integer >= 0")
+        # The engines count frames in 32 bits, and abort the process where the system has no threads left.
+        steps = "an integer from 1 to 2000000"
+        _check(1 <= self.max_episode_steps <= 2_000_000, "env.max_episode_steps", self.max_episode_steps, steps)
+        _check(0 <= self.threads <= 1024, "env.threads", self.threads, "an integer from 0 to 1024")
         _check(self.timeout > 0, "env.timeout", self.timeout, "seconds > 0")
 
 
@@ -155,8 +159,8 @@ class NetworkConfig:
     normalization: Literal["running", "frame", "none"] = "running"
 
     def __post_init__(self) -> None:
-        _check(self.dense >= 0, "network.dense", self.dense, "an integer >= 0")
-        _check(self.lstm >= 1, "network.lstm", self.lstm, "an integer >= 1")
+        _check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
+        _check(1 <= self.lstm <= 16_384, "network.lstm", self.lstm, "an integer from 1 to 16384")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,9 +200,9 @@ class LearnerConfig:
     vision: HeadConfig = HeadConfig()
 
     def __post_init__(self) -> None:
-        for key in ("rollout_length", "minibatches", "epochs"):
-            _check(getattr(self, key) >= 1, f"learner.{key}", getattr(self, key), "an integer >= 1")
-        _check(self.rollout_length >= 2, "learner.rollout_length", self.rollout_length, "an integer >= 2")
+        for key, least, most in (("rollout_length", 2, 100_000), ("minibatches", 1, 100_000), ("epochs", 1, 1000)):
+            value = getattr(self, key)
+            _check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
         for key in ("learning_rate", "adam_eps"):
             _check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
         for key in ("adam_b1", "adam_b2"):
@@ -226,7 +230,7 @@ class TrainConfig:
         for key in ("log_every", "checkpoint_every"):
             _check(getattr(self, key) > 0, f"train.{key}", getattr(self, key), "seconds > 0")
         for key in ("keep", "max_skipped"):
-            _check(getattr(self, key) >= 1, f"train.{key}", getattr(self, key), "an integer >= 1")
+            _check(1 <= getattr(self, key) <= 10**9, f"train.{key}", getattr(self, key), "an integer from 1 to 10^9")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -286,6 +290,12 @@ class Config:
             self.env.groups,
             f"a divisor of learner.minibatches={self.learner.minibatches}",
         )
+        # Each environment's steps and the updates are counted in 32 bits.
+        rollouts = -(-self.train.env_steps // (self.env.num_envs * self.learner.rollout_length))
+        most = 2**31 // max(self.learner.rollout_length, self.learner.minibatches * self.learner.epochs) - 2
+        steps = most * self.env.num_envs * self.learner.rollout_length
+        accepted = f"at most {steps} with these learner.rollout_length, minibatches, epochs and env.num_envs"
+        _check(rollouts <= most, "train.env_steps", self.train.env_steps, accepted)
 
     @property
     def run_dir(self) -> str:

@@ -43,6 +43,7 @@ class Call(NamedTuple):
 
     number: int  # tells it from the same call later
     what: str
+    timeout: float  # seconds
 
 
 class Watchdog:
@@ -85,13 +86,13 @@ class Watchdog:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def watched(self, what: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """`function`, of an environment: it may raise `EnvironmentFault`, and may hang."""
+    def watched(self, what: str, function: Callable[..., Any], *, patience: float = 1.0) -> Callable[..., Any]:
+        """`function`, of an environment: may raise `EnvironmentFault`, may hang; gets `patience` times the timeout."""
 
         @functools.wraps(function)
         def call(*arguments: Any) -> Any:
             self._calls += 1
-            self._call = Call(self._calls, what)
+            self._call = Call(self._calls, what, patience * self._timeout)
             try:
                 if self._overdue:
                     threading.Event().wait()  # the watchdog is about to save and exit
@@ -125,8 +126,8 @@ class Watchdog:
             waited = waited + passed if call is not None and call is seen else 0.0
             seen = call
             since_asked += passed if asked else 0.0
-            if call is not None and waited > self._timeout:
-                self._take_over(call, f"{call.what} has not returned for {self._timeout:g} s (env.timeout)", FAULT)
+            if call is not None and waited > call.timeout:
+                self._take_over(call, f"{call.what} has not returned for {call.timeout:g} s (env.timeout)", FAULT)
             elif since_asked > GRACE:
                 self._overdue = True
                 self._take_over(call, asked, 0)

@@ -136,11 +136,34 @@ def test_what_is_not_finite_is_skipped_and_counted(seek, where):
     after, metrics = update(state, rollout)
     jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (state.params, state.opt_state))
     assert metrics["skipped"] == 1 and after.skipped == state.skipped + 1
-    again, _ = update(after, rollout)
-    assert again.skipped == state.skipped + 2
+    assert metrics["skipped_updates"] == 1
+    again, metrics = update(after, rollout)
+    assert again.skipped == state.skipped + 2 and metrics["skipped_updates"] == 2
     (good,), _ = seek.collect()
     if where == "reward":
-        assert update(again, good)[0].skipped == 0
+        then, metrics = update(again, good)
+        assert then.skipped == 0 and metrics["skipped_updates"] == 2
+
+
+def test_a_parameter_that_overflows_is_caught_in_the_update_that_would_make_it(seek):
+    """Loss and gradient are finite, but the optimiser's memory makes a step of it that is not."""
+    (rollout,), _ = seek.collect()
+    state = jax.tree.map(jnp.copy, seek.state)
+    state = state._replace(opt_state=state.opt_state._replace(mu=jax.tree.map(lambda x: x + 1e38, state.opt_state.mu)))
+    before = jax.tree.map(jnp.copy, state)
+    after, metrics = seek.programs.update(state, rollout, np.int32(0), np.bool_(True))
+    assert np.isfinite(metrics["loss"]) and np.isfinite(metrics["grad_norm"])
+    assert metrics["skipped"] == 1 and not np.isfinite(metrics["param_norm"])
+    jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (before.params, before.opt_state))
+
+
+@pytest.mark.parametrize(("scale", "clipped"), [(0.0, 0), (1e4, 1), (np.nan, 0)])
+def test_a_clipped_update_is_counted(seek, scale, clipped):
+    (rollout,), _ = seek.collect()
+    rollout = rollout._replace(steps=rollout.steps._replace(reward=(rollout.steps.reward + 1) * scale))
+    state = jax.tree.map(jnp.copy, seek.state)
+    metrics = seek.programs.update(state, rollout, np.int32(0), np.bool_(True))[1]
+    assert metrics["clipped"] == clipped == (metrics["grad_norm"] > seek.config.learner.max_grad_norm)
 
 
 def test_frames_are_counted_once_however_many_passes():

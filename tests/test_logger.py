@@ -324,6 +324,22 @@ def test_whole_games_against_a_loop(convert):
     assert tracker.mean_length == pytest.approx(sum(n for _, n in expected[-10:]) / 10)
 
 
+def test_the_best_score_is_that_of_a_full_window_and_survives():
+    tracker = EpisodeTracker(1, window=2)
+    best = []
+    for score in (9.0, 1.0, 3.0, 2.0):
+        tracker.add(Outcome(score=np.float32([score]), is_over=np.array([True])))
+        best.append(tracker.best_score)
+    assert math.isnan(best[0]) and best[1:] == [5.0, 5.0, 5.0]
+    other = EpisodeTracker(1, window=2)
+    assert math.isnan(json.loads(json.dumps(other.get_state()))["best_score"] or math.nan)
+    other.set_state(json.loads(json.dumps(tracker.get_state())), same_games=False)
+    assert other.best_score == 5.0
+    old = {name: value for name, value in tracker.get_state().items() if name != "best_score"}
+    other.set_state(old, same_games=False)
+    assert math.isnan(other.best_score)
+
+
 def test_a_game_by_hand():
     tracker = EpisodeTracker(2)
     script = [([1, 0], [0, 0]), ([2, 5], [1, 0]), ([0, 0], [0, 0]), ([4, 1], [1, 1])]  # (score, is over)
