@@ -8,13 +8,13 @@ comma := ,
 STAMP := .venv/.installed-$(subst $(comma),-,$(EXTRAS))
 BIN := .venv/bin
 
-.PHONY: help setup train test test-slow check bench profile lock clean
+.PHONY: help setup train test test-slow check bench soak profile lock clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make train ARGS='experiment=constant70 game=breakout'   train one agent"
 	@echo "make test | test-slow | check     fast tests | the others | style and types"
-	@echo "make bench | profile              measure the parts | trace a short run"
+	@echo "make bench | profile | soak       measure the parts | trace a short run | train for half an hour and watch"
 	@echo "make setup EXTRAS=dev,cuda        (re)install, here for an NVIDIA GPU"
 	@echo "make lock | clean                 renew requirements.lock | remove what was installed"
 
@@ -46,7 +46,10 @@ check: $(STAMP)
 	$(BIN)/mypy
 
 bench: $(STAMP)
-	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+	for script in $(filter-out benchmarks/soak.py,$(wildcard benchmarks/*.py)); do $(BIN)/python $$script || exit 1; done
+
+soak: $(STAMP)
+	$(BIN)/python benchmarks/soak.py $(ARGS)
 
 profile: $(STAMP)
 	$(BIN)/python -m foajax.train profile=true $(ARGS)

@@ -134,7 +134,7 @@ class EnvConfig:
     def __post_init__(self) -> None:
         _check(1 <= self.num_envs <= 100_000, "env.num_envs", self.num_envs, "an integer from 1 to 100000")
         _check(self.groups >= 1, "env.groups", self.groups, "an integer >= 1")
-        fits = 8 <= min(self.frame_shape) and max(self.frame_shape) <= 10_000
+        fits = min(self.frame_shape) >= 8 and max(self.frame_shape) <= 10_000
         _check(fits, "env.frame_shape", self.frame_shape, "[height, width], each from 8 to 10000")
         _check("default" in self.crop_top, "env.crop_top", dict(self.crop_top), "a mapping with the key 'default'")
         for game, row in self.crop_top.items():

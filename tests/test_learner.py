@@ -183,7 +183,8 @@ def test_two_groups_see_what_each_would_alone():
 def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
     runs = [Loop("game=seek", *VIEW, f"seed={seed}") for seed in (0, 0, 1)]
     for loop in runs:
-        loop.run(3)
+        loop.run(25)  # two updates each
+    assert all(loop.state.updates == 50 for loop in runs)
     first, second, other = (jax.tree.leaves(loop.state.params) for loop in runs)
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))

@@ -1,6 +1,8 @@
 """The command itself, in real processes: runs, resumes, survives being killed, refuses in one line."""
 
+import contextlib
 import json
+import shutil
 import signal
 import time
 
@@ -9,36 +11,70 @@ import numpy as np
 import pytest
 from processes import TINY, finish, has_rows, rows, start, wait_for
 
+from foajax.checkpoint import Checkpoints
+from foajax.rundir import load_config, open_run
 from foajax.store import load_agent, save_agent
+from foajax.train import Run
+
+
+def same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, (one.params, one.statistics), (other.params, other.statistics))
 
 
 @pytest.fixture(scope="module")
 def breakout(tmp_path_factory):
     """A short run on the real game."""
     run = tmp_path_factory.mktemp("runs") / "breakout"
-    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=800")
+    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=1000")
     assert code == 0, err
     return run, out
 
 
 def test_a_run_leaves_everything_that_it_promises(breakout):
     run, out = breakout
-    assert "new run of constant50_sub2_packed on breakout" in out and "done: 800 env_steps" in out
-    assert rows(run)[-1]["env_steps"] == 800
+    assert "new run of constant50_sub2_packed on breakout" in out and "done: 1,000 env_steps" in out
+    assert rows(run)[-1]["env_steps"] == 1000
     for name in ("natural_entropy", "vision_entropy", "loss", "grad_norm", "score", "time"):
         assert name in rows(run)[-1]
     assert (run / "config.yaml").exists() and list((run / "tensorboard").iterdir())
-    assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 800
+    assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 1000
     assert json.loads((run / "run.json").read_text())["starts"][0]["packages"]["envpool"]
+
+
+def test_the_same_seed_gives_the_same_fifty_updates_on_the_emulators_too(breakout, tmp_path):
+    """Two minibatches of 40 steps a rollout; the engine's threads, which are as many as it likes, do not matter."""
+    run, _ = breakout
+    words = ["experiment=constant50_sub2_packed", *TINY, f"run={tmp_path}", "train.env_steps=1000", "env.threads=1"]
+    code, out, err = finish(*words)
+    assert code == 0, err
+    one, other = load_agent(run), load_agent(tmp_path)
+    assert one.env_steps == other.env_steps == 1000
+    same(one, other)
+    last, again = rows(run)[-1], rows(tmp_path)[-1]
+    assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in again.items() if k != "time"}
 
 
 def test_a_finished_run_goes_on_when_more_is_asked_for(breakout):
     run, _ = breakout
-    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=1000")
+    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=1200")
     assert code == 0, err
-    assert "resumed at 800 env_steps (episodes start anew, emulators cannot be saved)" in out
+    assert "resumed at 1,000 env_steps (episodes start anew, emulators cannot be saved)" in out
     steps = [row["env_steps"] for row in rows(run)]
-    assert steps == sorted(set(steps)) and steps[-1] == 1000
+    assert steps == sorted(set(steps)) and steps[-1] == 1200
+
+
+def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(breakout, tmp_path):
+    path = shutil.copytree(breakout[0], tmp_path / "run")
+    config = load_config(path)
+    with contextlib.ExitStack() as resources:
+        run = Run(config, resources.enter_context(open_run(config, command=[])), resources)
+        state, tracker, env_steps = run._state, run._tracker.get_state(), run._env_steps
+    template = jax.eval_shape(lambda: state)
+    saved = Checkpoints(path / "checkpoints", keep=None).restore({"train": template, "collector": []})
+    jax.tree.map(np.testing.assert_array_equal, state, saved.state["train"])  # optimiser and counters too
+    assert state.updates == env_steps / 40 * 2 and state.opt_state.count == state.updates
+    assert env_steps == saved.env_steps == rows(path)[-1]["env_steps"] >= 1000
+    assert tracker == saved.meta["tracker"] | {name: [0] * 8 for name in ("scores", "lengths")}
 
 
 def test_evaluation_plays_whole_games(breakout, tmp_path):
@@ -59,9 +95,7 @@ def test_a_shipped_agent_is_the_runs(breakout, tmp_path):
     stored = load_agent(run)
     save_agent(stored, tmp_path / "agent")
     shipped = load_agent(tmp_path / "agent")
-    jax.tree.map(
-        np.testing.assert_array_equal, (stored.params, stored.statistics), (shipped.params, shipped.statistics)
-    )
+    same(stored, shipped)
     assert shipped.env_steps == stored.env_steps and shipped.agent.config.sensor == stored.agent.config.sensor
 
 
@@ -74,7 +108,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
         assert code == 0, err
     assert "resumed at 600 env_steps (episodes go on)" in out
     a, b = load_agent(whole), load_agent(parts)
-    jax.tree.map(np.testing.assert_array_equal, (a.params, a.statistics), (b.params, b.statistics))
+    same(a, b)
     last, resumed = rows(whole)[-1], rows(parts)[-1]
     assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in resumed.items() if k != "time"}
 

@@ -1,0 +1,137 @@
+"""Does a long run stay as it began: memory, speed, open files?
+
+    python benchmarks/soak.py [minutes=30] [out=soak.json] [experiment=... game=... and other keys of a run]
+
+Trains in a process of its own and reads /proc while it does. What counts as the beginning is the minute after the
+first sixth of the time (of 30 minutes the first 5: compilation, and buffers that fill once), what counts as the end
+is the last one (of shorter trials a thirtieth of the time each, and speed over a sixth). Exit code 1 if resident
+memory has grown by more than 2 %, speed has fallen by more than 5 %, or there are more open files or threads than at
+the beginning. Linux only; run it on an otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+_EVERY = 1.0  # seconds between two looks
+
+
+class Sample(NamedTuple):
+    """What one look saw."""
+
+    time: float  # seconds since the process began
+    memory: int  # resident, bytes
+    files: int  # open
+    threads: int
+
+
+def sample(process: int, begin: float) -> Sample:
+    """Reads a process' own account in /proc."""
+    proc = Path(f"/proc/{process}")
+    status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
+    return Sample(
+        time=time.monotonic() - begin,
+        memory=int(status["VmRSS"].split()[0]) * 1024,
+        files=len(os.listdir(proc / "fd")),
+        threads=int(status["Threads"]),
+    )
+
+
+def verdict(samples: Sequence[Sample], rows: Sequence[dict], seconds: float) -> dict[str, float]:
+    """Beginning and end of each quantity, over windows of a run of `seconds`.
+
+    Args:
+      samples: in order.
+      rows: of `metrics.jsonl`; their `time` is the run's own.
+      seconds: how long the run was to last.
+    """
+    settled, window, end = seconds / 6, seconds / 30, samples[-1].time
+    first = [s for s in samples if settled <= s.time < settled + window]
+    last = [s for s in samples if s.time >= end - window]
+    result = {}
+    for name in ("memory", "files", "threads"):
+        # A checkpoint being written opens files and has a thread for a moment: the least is what stays.
+        pick = statistics.median if name == "memory" else min
+        result[f"{name}_begin"], result[f"{name}_end"] = (
+            pick(getattr(s, name) for s in part) for part in (first, last)
+        )
+    times = [row["time"] for row in rows]
+    result["speed_begin"] = _speed([row for row in rows if times[0] + settled <= row["time"] <= times[0] + 2 * settled])
+    result["speed_end"] = _speed([row for row in rows if row["time"] >= times[-1] - settled])
+    return result
+
+
+def complaints(result: dict[str, float]) -> list[str]:
+    """What is not as it should be; empty where all is well."""
+    growth = result["memory_end"] / result["memory_begin"] - 1
+    fall = 1 - result["speed_end"] / result["speed_begin"]
+    found = []
+    if growth > 0.02:
+        found.append(f"memory has grown by {100 * growth:.2f} %")
+    if fall > 0.05:
+        found.append(f"speed has fallen by {100 * fall:.2f} %")
+    for name in ("files", "threads"):
+        if result[f"{name}_end"] > result[f"{name}_begin"]:
+            found.append(f"{name} have become more: {result[f'{name}_begin']:.0f}, {result[f'{name}_end']:.0f}")
+    return found
+
+
+def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample], list[dict], int]:
+    """Trains for `seconds`; returns the samples, the rows of metrics and the exit code."""
+    command = [sys.executable, "-m", "foajax.train", *words, f"run={run}", "train.env_steps=2000000000"]
+    begin = time.monotonic()
+    with (run.parent / "log").open("w") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
+        samples = []
+        while time.monotonic() - begin < seconds and process.poll() is None:
+            time.sleep(_EVERY)
+            if process.poll() is None:
+                samples.append(sample(process.pid, begin))
+        process.send_signal(signal.SIGTERM)
+        code = process.wait()
+    if code:
+        print((run.parent / "log").read_text(), file=sys.stderr)
+        return samples, [], code
+    return samples, [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()], 0
+
+
+def main(words: Sequence[str]) -> int:
+    """The command."""
+    options = dict(word.split("=", 1) for word in words if word.startswith(("minutes=", "out=")))
+    seconds = 60 * float(options.get("minutes", 30))
+    rest = [word for word in words if not word.startswith(("minutes=", "out="))]
+    with tempfile.TemporaryDirectory() as directory:
+        samples, rows, code = train(rest, Path(directory) / "run", seconds)
+    if code:
+        return code
+    result = verdict(samples, rows, seconds)
+    for name in ("memory", "files", "threads", "speed"):
+        begin, end = result[f"{name}_begin"], result[f"{name}_end"]
+        print(f"{name:8} {begin:14.1f} {end:14.1f} {100 * (end / begin - 1):+7.2f} %")
+    found = complaints(result)
+    print("; ".join(found) or f"as it began, after {seconds / 60:g} minutes and {rows[-1]['env_steps']:,} env_steps")
+    if "out" in options:
+        machine = {"machine": platform.platform(), "cores": os.cpu_count(), "jax": version("jax"), "words": rest}
+        report = machine | {"seconds": seconds, "result": result, "samples": samples}
+        Path(options["out"]).write_text(json.dumps(report) + "\n")
+    return 1 if found else 0
+
+
+def _speed(rows: Sequence[dict]) -> float:
+    """Steps a second between the first and the last of some rows."""
+    return (rows[-1]["env_steps"] - rows[0]["env_steps"]) / (rows[-1]["time"] - rows[0]["time"])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
