@@ -19,7 +19,7 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from foajax import cli
+from foajax import cli, durable
 from foajax.agent import Agent
 from foajax.checkpoint import Checkpoints
 from foajax.config import ConfigError, to_mapping
@@ -44,7 +44,7 @@ class Stored(NamedTuple):
 def save_facts(agent: Agent, directory: Path, **more: int) -> None:
     """Writes what `load_agent` needs beside `config.yaml`."""
     facts = {"num_actions": agent.num_actions, "crop_top": agent.crop_top}
-    (directory / _FACTS).write_text(json.dumps(facts | more) + "\n")
+    durable.replace(directory / _FACTS, (json.dumps(facts | more) + "\n").encode())
 
 
 def load_agent(path: str | Path) -> Stored:

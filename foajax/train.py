@@ -271,7 +271,12 @@ def _train(config: Config) -> None:
             return
         stop = StopRequest()
         run_dir = resources.enter_context(open_run(config, command=[sys.executable, *sys.argv]))
-        Run(config, run_dir, resources).loop(stop)
+        try:
+            run = Run(config, run_dir, resources)
+        except OSError as error:  # its files: whatever an environment raises is a fault of its own
+            reason = f"cannot be used ({error})"
+            raise ConfigError(f"run={run_dir.path}: {reason}; accepted is a directory to write to") from None
+        run.loop(stop)
 
 
 if __name__ == "__main__":

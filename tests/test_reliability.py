@@ -69,6 +69,14 @@ def test_no_usable_checkpoint_is_one_line_and_starts_nothing(run):
     assert sorted((run / "checkpoints").rglob("*")) == before
 
 
+@pytest.mark.parametrize("name", ["agent.json", "metrics.jsonl"])
+def test_a_file_that_cannot_be_written_at_the_start_is_one_line(tmp_path, name):
+    (tmp_path / name).mkdir()
+    code, out, err = finish(*SEEK, f"run={tmp_path}")
+    assert code == 2 and out == "" and len(err.splitlines()) == 1
+    assert err.startswith(f"foajax: error: run={tmp_path}: cannot be used (") and name in err
+
+
 def test_the_best_so_far_is_kept_over_starts(run):
     steps = Checkpoints(run / "checkpoints", keep=None).steps()
     scored = {step: s for step in steps if (s := score(run, step)) is not None}
