@@ -32,8 +32,12 @@ def start(*arguments: str, module: str = "train", **options: Any) -> subprocess.
 
 def finish(*arguments: str, module: str = "train", **options: Any) -> tuple[int, str, str]:
     """Exit code, stdout, stderr."""
-    process = start(*arguments, module=module, **options)
-    out, err = process.communicate(timeout=300)
+    with start(*arguments, module=module, **options) as process:
+        try:
+            out, err = process.communicate(timeout=600)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
     return process.returncode, out, err
 
 
@@ -53,9 +57,11 @@ def newest(run: Path) -> int:
     return max((int(n) for n in os.listdir(directory) if n.isdigit()), default=0) if directory.exists() else 0
 
 
-def wait_for(condition: Callable[[], object], process: subprocess.Popen[str], timeout: float = 200) -> None:
+def wait_for(condition: Callable[[], object], process: subprocess.Popen[str], timeout: float = 300) -> None:
     end = time.monotonic() + timeout
     while not condition():
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
+        if time.monotonic() > end:
+            process.kill()
+            raise TimeoutError(process.communicate())
         time.sleep(0.02)

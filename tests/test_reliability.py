@@ -124,11 +124,10 @@ def test_a_full_disk_stops_nothing(small_disk, tmp_path):
     with log.open("w") as out:
         process = start(*SEEK, f"run={run}", *words, stdout=out, stderr=out)
         wait_for(lambda: newest(run), process)
-        with (small_disk / "ballast").open("wb") as ballast:
+        with (small_disk / "ballast").open("wb", buffering=0) as ballast:
             while process.poll() is None:  # until there is no room at all
                 try:
                     ballast.write(bytes(4096))
-                    ballast.flush()
                 except OSError:
                     break
         wait_for(lambda: "was not written: [Errno 28] No space left on device" in log.read_text(), process)
