@@ -69,7 +69,7 @@ def test_no_usable_checkpoint_is_one_line_and_starts_nothing(run):
     assert sorted((run / "checkpoints").rglob("*")) == before
 
 
-@pytest.mark.parametrize("name", ["agent.json", "metrics.jsonl"])
+@pytest.mark.parametrize("name", ["agent.json", pytest.param("metrics.jsonl", marks=pytest.mark.slow)])
 def test_a_file_that_cannot_be_written_at_the_start_is_one_line(tmp_path, name):
     (tmp_path / name).mkdir()
     code, out, err = finish(*SEEK, f"run={tmp_path}")
