@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -47,6 +48,10 @@ class Environment(Protocol):
     num_actions: int
     screen_shape: tuple[int, ...]  # of `TimeStep.frame` without the batch
     crop_top: int | None  # first of the 160 screen rows kept; None where the screen is the frame
+
+    @property
+    def lives(self) -> np.ndarray | None:
+        """Left in each game after the last step, int [B]; None where games have none."""
 
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins all episodes; once, before the first `send`."""
@@ -89,7 +94,7 @@ class EnvPoolEnvironment:
 
     crop_top: int | None
     screen_shape: tuple[int, ...] = SCREEN_SHAPE
-    _lives: np.ndarray  # after the last step
+    lives: np.ndarray
     _ended: np.ndarray  # whether the last step ended an episode
     _over: np.ndarray  # whether it ended a game
 
@@ -119,12 +124,13 @@ class EnvPoolEnvironment:
             max_episode_steps=env.max_episode_steps,
         )
         self.num_envs, self.num_actions = num_envs, int(self._pool.action_space.n)
+        self.lives = np.zeros(num_envs, int)  # until `reset`
         self._episodic_life = env.episodic_life
 
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins all games. A second call would go on with the games, at the next life."""
         screen, info = self._pool.reset()
-        self._lives = info["lives"]
+        self.lives = info["lives"]
         self._ended = self._over = np.zeros(self.num_envs, bool)
         return _first_step(screen[:, 0])
 
@@ -141,8 +147,8 @@ class EnvPoolEnvironment:
         """
         screen, reward, terminated, truncated, info = self._pool.recv()
         lives, game_over = info["lives"], info["terminated"] == 1
-        lost = self._episodic_life & (lives > 0) & (lives < self._lives)
-        restarted = self._ended & ~self._over & (lives > self._lives)
+        lost = self._episodic_life & (lives > 0) & (lives < self.lives)
+        restarted = self._ended & ~self._over & (lives > self.lives)
         is_over = game_over | truncated | restarted
         timestep = TimeStep(
             frame=screen[:, 0],
@@ -150,7 +156,7 @@ class EnvPoolEnvironment:
             is_first=self._ended,
             is_terminal=terminated | (truncated & (game_over | lost)),
         )
-        self._lives, self._ended, self._over = lives, terminated | truncated, is_over
+        self.lives, self._ended, self._over = lives, terminated | truncated, is_over
         return timestep, Outcome(score=info["reward"], is_over=is_over)
 
     def render(self) -> np.ndarray:
@@ -168,7 +174,7 @@ class AleEnvironment:
 
     crop_top: int | None
     screen_shape: tuple[int, ...] = SCREEN_SHAPE
-    _lives: np.ndarray  # after the last step
+    lives: np.ndarray
     _ended: np.ndarray  # whether the last step ended an episode
     _over: np.ndarray  # whether it ended a game
 
@@ -200,12 +206,13 @@ class AleEnvironment:
         fire = env.fire_on_reset and Action.FIRE in actions
         self._restart = np.int32(actions.index(Action.FIRE) if fire else 0)
         self.num_envs, self.num_actions = num_envs, len(actions)
+        self.lives = np.zeros(num_envs, int)  # until `reset`
         self._seed, self._clip, self._max_steps = seed, env.clip_rewards, env.max_episode_steps
 
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins all games, from the seed."""
         screen, info = self._env.reset(seed=self._seed)
-        self._lives, self._steps = info["lives"], np.zeros(self.num_envs, int)
+        self.lives, self._steps = info["lives"], np.zeros(self.num_envs, int)
         self._ended = self._over = np.zeros(self.num_envs, bool)
         return _first_step(screen[:, 0])
 
@@ -217,13 +224,13 @@ class AleEnvironment:
         """The step; points made by the FIRE after a lost life count in the score alone."""
         screen, points, terminated, truncated, info = self._env.recv()
         lives, score = info["lives"], points.astype(np.float32)
-        lost = terminated & (lives > 0) & (lives < self._lives)
+        lost = terminated & (lives > 0) & (lives < self.lives)
         # ale-py does not flag a step limit that falls together with a lost life.
         self._steps = np.where(self._over, 0, self._steps + 1)
         is_over = (terminated & ~lost) | (self._steps >= self._max_steps)
         reward = np.where(self._ended, np.float32(0), np.sign(score) if self._clip else score)
         timestep = TimeStep(frame=screen[:, 0], reward=reward, is_first=self._ended, is_terminal=terminated)
-        self._lives, self._ended, self._over = lives, terminated | truncated, is_over
+        self.lives, self._ended, self._over = lives, terminated | truncated, is_over
         return timestep, Outcome(score=score, is_over=is_over)
 
     def render(self) -> np.ndarray:
@@ -233,6 +240,35 @@ class AleEnvironment:
     def close(self) -> None:
         """Drops the engine, whose threads end with it."""
         del self._env
+
+
+def action_names(config: Config) -> tuple[str, ...] | None:
+    """The natural actions' names, e.g. ("noop", "fire", "right", "left"); None where they have none.
+
+    Raises:
+      ConfigError: there is no such game.
+    """
+    if config.game == "seek":
+        return ("leave", "take")
+    if not is_atari(config):
+        return None
+    from ale_py import ALEInterface, LoggerMode, roms  # here, like EnvPool
+
+    name = atari_name(config.game, roms.get_all_rom_ids())
+    ALEInterface.setLoggerMode(LoggerMode.Error)
+    emulator = ALEInterface()
+    emulator.loadROM(cast(Path, roms.get_rom_path(name)))
+    return tuple(action.name.lower() for action in emulator.getMinimalActionSet())
+
+
+def steps_per_second(config: Config) -> float:
+    """Agent steps in a second of the game: an Atari console shows 60 frames a second. 15 elsewhere, as with Atari."""
+    return 60 / config.env.frame_skip if is_atari(config) else 15.0
+
+
+def is_atari(config: Config) -> bool:
+    """Whether an emulator plays the game."""
+    return config.game not in OWN and not config.game.startswith("gymnasium:")
 
 
 def atari_name(game: str, known: Iterable[str]) -> str:

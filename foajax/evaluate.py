@@ -22,7 +22,7 @@ from foajax.envs import make
 from foajax.store import load_agent
 from foajax.types import FrameStatistics, Params
 
-_EVALUATION_SEED = 1_000_003  # apart from the seeds of training
+EVALUATION_SEED = 1_000_003  # apart from the seeds of training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ def play(
     """
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
-    environment = make(config, num_envs=num_envs, seed=_EVALUATION_SEED + seed)
+    environment = make(config, num_envs=num_envs, seed=EVALUATION_SEED + seed)
     agent = Agent(config, environment.num_actions, environment.crop_top)
     act = jax.jit(functools.partial(agent.act, greedy=greedy))
     state = agent.initial_state(num_envs)

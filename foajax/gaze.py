@@ -23,6 +23,7 @@ Shape = tuple[int, int]  # rows, columns
 _STRAIGHT = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
 _DIAGONAL = [(-1, -1), (-1, 1), (1, -1), (1, 1)]
 DIRECTIONS = np.array(_STRAIGHT + _DIAGONAL, np.int32)
+NAMES = ("stay", "up", "down", "left", "right", "up left", "up right", "down left", "down right")
 
 
 def move(

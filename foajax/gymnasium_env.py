@@ -22,6 +22,7 @@ class GymnasiumEnvironment:
     """A batch of one Gymnasium environment, an `envs.Environment`. They step one after another, in `recv`."""
 
     crop_top: int | None = None
+    lives: np.ndarray | None = None
 
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
         name = config.game.removeprefix("gymnasium:")

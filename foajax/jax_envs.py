@@ -86,6 +86,7 @@ class JaxEnvironment:
     """
 
     crop_top: int | None = None
+    lives: np.ndarray | None = None
 
     def __init__(self, task: Task, *, num_envs: int, seed: int) -> None:
         self.num_envs = num_envs

@@ -23,8 +23,9 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from foajax import cli, envs
 from foajax.compose import compose
-from foajax.config import Config, ConfigError, LogPolarSensor, RingSensor, Sensor
-from foajax.foveation import picture, pixel_count, ring_boxes, sense
+from foajax.config import Config, ConfigError, RingSensor, Sensor
+from foajax.drawing import draw_gaze
+from foajax.foveation import picture, pixel_count, sense
 from foajax.frames import to_frame
 
 PAPER = (
@@ -41,7 +42,6 @@ _ALL = (*PAPER, "logpolar")
 _SIDE = 240  # of a panel, pixels: about three for each of an 80x80 frame
 _GAP = 12
 _LINE = 18  # of text
-_RINGS = ("#ffb000", "#2fb8ff", "#ff5c9a")  # inner to outer, told apart by the colour-blind too
 _INK, _FAINT, _PAPER = "#222222", "#777777", "#ffffff"
 
 Panel = tuple[str, Image.Image]  # caption and picture
@@ -120,14 +120,8 @@ def _look(
 def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.Image:
     """The frame with the focal areas and the focal point drawn on it."""
     image = _grey(frame)
-    pen, scale = ImageDraw.Draw(image), image.width // frame.shape[1]
-    shape = pen.ellipse if isinstance(sensor, LogPolarSensor) else pen.rectangle
-    for i, (top, left, height, width) in enumerate(ring_boxes(point, sensor)):
-        corners = [scale * left, scale * top, scale * (left + width) - 1, scale * (top + height) - 1]
-        shape(corners, outline=_RINGS[i % len(_RINGS)], width=2)
-    y, x = scale * point[0], scale * point[1]
-    pen.line([x - 5, y, x + 5, y], fill=_RINGS[0], width=2)
-    pen.line([x, y - 5, x, y + 5], fill=_RINGS[0], width=2)
+    scale = image.width // frame.shape[1]
+    draw_gaze(image, sensor, point, scale=(scale, scale))
     return image
 
 

@@ -7,6 +7,7 @@ import os
 os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports jax
 
 import jax
+import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
@@ -20,3 +21,36 @@ def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled programs between test runs: most of the time of a first run is compilation."""
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+@pytest.fixture(scope="session")
+def untrained():
+    """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
+    from foajax.frames import initial_statistics
+    from foajax.store import Stored
+
+    def make(agent, env_steps=0):
+        random = np.random.default_rng(0)
+        shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
+        params = jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
+        return Stored(agent, params, initial_statistics(), env_steps)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def breakout_agent(untrained):
+    """A small agent for Breakout that has learned nothing."""
+    from foajax.agent import Agent
+    from foajax.compose import compose
+
+    words = ["sensor=decreasing_p_packed", "name=small", "network.dense=16", "network.lstm=16", "gaze.bounds=point"]
+    return untrained(Agent(compose(words), num_actions=4, crop_top=34))
+
+
+@pytest.fixture(scope="session")
+def recording(breakout_agent):
+    """The first decisions of a game of Breakout on the real emulator."""
+    from foajax.recording import record
+
+    return next(record(breakout_agent, seed=2, max_steps=130))

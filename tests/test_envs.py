@@ -184,7 +184,7 @@ def test_a_game_that_ends_in_the_no_ops_is_over_with_the_next_first_step():
 
     answers = [answer([1, 1], [True, True]), answer([5, 1], [False, False]), answer([5, 1], [False, False])]
     environment._pool = SimpleNamespace(recv=lambda: answers.pop(0), close=lambda: None)
-    environment._lives = np.array([2, 2])
+    environment.lives = np.array([2, 2])
     outcomes = [environment.recv()[1].is_over.tolist() for _ in range(3)]
     assert outcomes == [[False, False], [True, False], [False, False]]
 

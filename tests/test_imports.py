@@ -47,13 +47,30 @@ WORLD = {
     "jax_envs",
     "logger",
     "probes",
-    "render",
     "rundir",
     "seek",
     "watchdog",
 }
 # Where the two meet: the loop that acts, and the commands around a trained agent.
-MEETING = {"cost", "dump", "evaluate", "profiling", "report", "rollout", "show", "store", "train", "wrapper"}
+MEETING = {
+    "cost",
+    "drawing",
+    "dump",
+    "evaluate",
+    "heatmap",
+    "painting",
+    "player",
+    "profiling",
+    "recording",
+    "render",
+    "report",
+    "rollout",
+    "scene",
+    "show",
+    "store",
+    "train",
+    "wrapper",
+}
 
 # What only some may import, so that an engine or a library can be replaced in one place.
 ONLY_IN = {

@@ -1,0 +1,212 @@
+"""The gaze player, in a real browser: what it draws against what was recorded."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foajax import cli, player
+from foajax.painting import packed, paint, tables
+from foajax.recording import Screens
+
+ARTEFACTS = Path(__file__).resolve().parent.parent / "build"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = [
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+]
+browser_needed = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
+)
+
+GAZE = """() => {  // centre of all that is drawn in the colour of the focal point, in CSS pixels
+  const canvas = document.getElementById("gaze"), ratio = canvas.width / canvas.clientWidth;
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  let x = 0, y = 0, n = 0;
+  for (let i = 0; i < data.length; i += 4) if (data[i] === 255 && data[i + 1] === 176 && data[i + 2] === 0) {
+    x += i / 4 % canvas.width + 0.5; y += Math.floor(i / 4 / canvas.width) + 0.5; n++;
+  }
+  return [y / n / ratio, x / n / ratio, n];
+}"""
+PIXELS = """id => {
+  const canvas = document.getElementById(id);
+  return Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data);
+}"""
+
+
+@contextlib.contextmanager
+def opened(file):
+    """The page in a new browser. Ends with an error if the page complained or asked for anything else."""
+    from playwright.sync_api import sync_playwright
+
+    complaints, requests = [], []
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1366, "height": 768})
+        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(file.as_uri())
+        page.wait_for_function("document.body.dataset.shown === '0'")
+        yield page
+        browser.close()
+    assert complaints == []
+    assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [file.as_uri()]
+
+
+def go(page, step):
+    page.locator("#slider").fill(str(step))
+    page.wait_for_function(f"document.body.dataset.shown === '{step}'")
+
+
+@browser_needed
+def test_the_player(recording, tmp_path):
+    with opened(player.write_page(recording, tmp_path)) as page:
+        pictures_are_what_was_recorded(page, recording)
+        numbers_are_what_was_recorded(page, recording)
+        the_focal_point_is_where_it_was(page, recording)
+        keys_and_mouse_move_it(page, recording)
+        it_plays(page)
+        go(page, 57)
+        ARTEFACTS.mkdir(exist_ok=True)
+        page.screenshot(path=ARTEFACTS / "player.png")
+
+
+def pictures_are_what_was_recorded(page, recording):
+    values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
+    painting = tables(packed(recording.config.sensor), recording.config.env.frame_shape)
+    for step in (119, 0, 60, 59, 129):  # parts of 60 steps begin and end here
+        go(page, step)
+        screen = np.array(page.evaluate(PIXELS, "screen")).reshape(210, 160, 4)
+        np.testing.assert_array_equal(screen[..., :3], recording.screens[step])
+        view = np.array(page.evaluate(PIXELS, "view")).reshape(80, 80, 4)[..., 0]
+        picture = paint(values[step], recording.focal_point[step], painting)
+        np.testing.assert_array_equal(view, picture.astype(int) * 255 // values.max())
+
+
+def numbers_are_what_was_recorded(page, recording):
+    go(page, 77)
+    for head, probs in (("natural", recording.natural_probs), ("vision", recording.vision_probs)):
+        shares = page.locator(f"#{head} .row > :last-child").all_inner_texts()
+        np.testing.assert_allclose([float(share.rstrip("%")) for share in shares], 100 * probs[77], atol=0.8)
+        chosen = page.locator(f"#{head} .row.chosen > :first-child").inner_text()
+        names = recording.actions if head == "natural" else player.NAMES
+        assert chosen == names[getattr(recording, f"{head}_action")[77]]
+        value = float(page.locator(f"#{head}Value").inner_text())
+        assert value == pytest.approx(getattr(recording, f"{head}_value")[77], abs=0.006)
+    assert page.locator("#lives").inner_text() == str(recording.lives[77])
+    assert float(page.locator("#score").inner_text()) == recording.score[77]
+
+
+def the_focal_point_is_where_it_was(page, recording):
+    page.keyboard.press("a")  # areas and trail off: the cross alone
+    page.keyboard.press("t")
+    top, down, across = recording.frame_origin
+    for step in (3, 64, 128):
+        go(page, step)
+        y, x, count = page.evaluate(GAZE)
+        unit = page.locator("#screen").bounding_box()["width"] / 160
+        expected = recording.focal_point[step] * [down, across] + [top, 0]
+        assert count > 10
+        np.testing.assert_allclose([y, x], unit * expected, atol=0.6)
+    page.keyboard.press("a")
+    page.keyboard.press("t")
+    assert page.evaluate(GAZE)[2] > 10  # drawn, with the inner area in the same colour
+
+
+def keys_and_mouse_move_it(page, recording):
+    go(page, 50)
+    for key, step in (("ArrowRight", 51), ("Shift+ArrowLeft", 36), ("ArrowLeft", 35), ("End", 129), ("Home", 0)):
+        page.keyboard.press(key)
+        page.wait_for_function(f"document.body.dataset.shown === '{step}'")
+    page.keyboard.press("]")
+    changes = np.flatnonzero((np.diff(recording.score) != 0) | recording.is_first[1:]) + 1
+    page.wait_for_function(f"document.body.dataset.shown === '{changes[0]}'")
+    box = page.locator("#timeline").bounding_box()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 20, steps=5)
+    page.mouse.up()
+    page.wait_for_function(f"document.body.dataset.shown === '{round(0.75 * 129)}'")
+
+
+def it_plays(page):
+    go(page, 20)
+    page.locator("#play").click()
+    begin = time.monotonic()
+    page.wait_for_function("+document.body.dataset.shown >= 35")
+    assert 0.5 < time.monotonic() - begin < 10  # a second on a machine that is not busy
+    page.keyboard.press(" ")
+    assert page.locator("#play").inner_text() == "Play"
+    stopped = page.locator("#slider").input_value()
+    page.wait_for_timeout(200)
+    assert page.locator("#slider").input_value() == stopped
+
+
+@browser_needed
+@pytest.mark.slow
+def test_ten_minutes_fit_into_15_mb_and_scrub_without_lag(recording, tmp_path):
+    page_file = player.write_page(lengthened(recording, 9000), tmp_path)
+    assert page_file.stat().st_size < 15e6
+    random, waits = np.random.default_rng(0), []
+    with opened(page_file) as page:
+        for step in random.integers(0, 9000, 60).tolist():
+            script = """step => new Promise(done => {
+              const begin = performance.now();
+              seek(step);
+              const look = () => document.body.dataset.shown === String(step)
+                ? done(performance.now() - begin) : requestAnimationFrame(look);
+              look();
+            })"""
+            waits.append(page.evaluate(script, step))
+    assert np.median(waits) < 60  # some four frames of a 60 Hz display, also where nothing is cached
+
+
+def lengthened(recording, steps):
+    """The same steps again and again."""
+    rows = np.arange(steps) % len(recording.screens)
+    screens = Screens()
+    for row in rows:
+        screens.append(recording.screens[row])
+    columns = {
+        name: value[rows]
+        for name, value in recording._asdict().items()
+        if isinstance(value, np.ndarray) and len(value) == len(recording.screens)
+    }
+    return recording._replace(screens=screens, images=tuple(part[rows] for part in recording.images), **columns)
+
+
+def test_more_colours_than_a_palette_has_and_large_screens_are_reduced(recording):
+    noise, screens = np.random.default_rng(0), Screens()
+    for _ in range(70):
+        screens.append(noise.integers(0, 256, (400, 600, 3), dtype=np.uint8))
+    few = lengthened(recording, 70)._replace(screens=screens, crop_top=None)
+    encoded = player.encode(few)
+    height, width = encoded["screen_shape"]
+    assert height * width < 48_500 and width / height == pytest.approx(1.5, rel=0.01)
+    assert len(encoded["palette"]) == 256 and len(encoded["screens"]) == len(encoded["values"]) == 2
+    np.testing.assert_allclose(encoded["origin"], [0, height / 80, width / 80])
+
+
+def test_a_gaze_that_is_not_learned_leaves_its_head_out(recording):
+    encoded = player.encode(recording._replace(vision_probs=None, vision_value=None, lives=None))
+    assert not {"vision_probs", "vision_value", "lives"} & set(encoded["columns"])
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["run=nowhere"], "run=nowhere: does not exist"),
+        (["run=nowhere", "steps=0"], "steps=0: accepted is null or an integer >= 1"),
+        (["run=nowhere", "policy=best"], "policy=best: accepted is one of sampled, greedy"),
+    ],
+)
+def test_a_mistake_is_one_line(words, message, capsys):
+    assert cli.run(player.player, words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"foajax: error: {message}") and error.count("\n") == 1
