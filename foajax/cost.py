@@ -86,6 +86,13 @@ def measure(experiments: Sequence[str], *, torso: str, repeats: int) -> list[dic
     return records
 
 
+def measure_decisions(configs: Sequence[Config], *, repeats: int) -> list[dict[str, Any]]:
+    """For each run what is counted and, timed on this machine, `decision_us_batch1`."""
+    subjects, key = [_subject(config) for config in configs], "decision_us_batch1"
+    times = _time([{key: subject.calls[key]} for subject in subjects], repeats)
+    return [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
+
+
 def sense(agent: Agent, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
     """The sensor's part of a decision."""
     return agent.sense(frame, focal_point)

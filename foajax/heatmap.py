@@ -17,11 +17,12 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from foajax import durable
-from foajax.config import Config
+from foajax.config import Config, ConfigError
 from foajax.drawing import STYLE
 from foajax.gaze import limits
 from foajax.recording import Recording
 
+FILE = "heatmap.json"
 _COLOURS = colormaps["inferno"](np.linspace(0.4, 1, 256))  # without the end that is as dark as a game
 _ZOOM = 0.25  # gaze that can reach less than this share of the frame is shown enlarged as well
 
@@ -107,7 +108,19 @@ def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
 def save(heat: HeatMap, directory: Path, title: str) -> None:
     """Writes `heatmap.png`, and `heatmap.json` with the counts behind it."""
     draw(heat, title).savefig(directory / "heatmap.png", dpi=150)
-    durable.replace(directory / "heatmap.json", (json.dumps(heat.to_json()) + "\n").encode())
+    durable.replace(directory / FILE, (json.dumps(heat.to_json()) + "\n").encode())
+
+
+def read(file: Path) -> HeatMap:
+    """What `save` wrote.
+
+    Raises:
+      ConfigError: the file is something else.
+    """
+    try:
+        return HeatMap.from_json(json.loads(file.read_text()))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"{file}: is no heat map; remove it") from None
 
 
 def draw(heat: HeatMap, title: str) -> Figure:

@@ -71,7 +71,7 @@ def write_video(recording: Recording, file: Path, bar: Progress) -> None:
 
 
 def _write_mp4(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
-    """Through a pipe to the ffmpeg that imageio-ffmpeg brings (its own writer forks, which JAX's threads do not bear)."""
+    """Through a pipe to the ffmpeg of imageio-ffmpeg, whose own writer forks, which JAX's threads do not bear."""
     from imageio_ffmpeg import get_ffmpeg_exe  # an extra
 
     first = next(frames)

@@ -158,7 +158,7 @@ def _settle_config(path: Path, config: Config) -> None:
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     file = path / _CONFIG
     if os.path.lexists(file):
-        stored, asked = (dict(_flatten(to_mapping(c))) for c in (load_config(path), config))
+        stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
         # With a falling learning rate the length of the run is part of what a step learns.
         free = _FREE - {"train.env_steps"} if config.learner.schedule == "linear" else _FREE
         keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
@@ -171,11 +171,11 @@ def _settle_config(path: Path, config: Config) -> None:
     durable.replace(file, text.encode())
 
 
-def _flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted keys and their values."""
     for key, value in mapping.items():
         if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{key}.")
+            yield from flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 

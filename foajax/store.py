@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -41,10 +41,18 @@ class Stored(NamedTuple):
     env_steps: int  # it has been trained for
 
 
-def save_facts(agent: Agent, directory: Path, **more: int) -> None:
-    """Writes what `load_agent` needs beside `config.yaml`."""
+def save_facts(agent: Agent, directory: Path, **more: Any) -> None:
+    """Writes what `load_agent` needs beside `config.yaml`, and more facts if there are."""
     facts = {"num_actions": agent.num_actions, "crop_top": agent.crop_top}
     durable.replace(directory / _FACTS, (json.dumps(facts | more) + "\n").encode())
+
+
+def load_score(path: str | Path) -> dict[str, Any] | None:
+    """What `evaluate` found of a shipped agent: mean, stderr, episodes, policy; None where nobody has said."""
+    try:
+        return json.loads((Path(path) / _FACTS).read_text()).get("score")
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def load_agent(path: str | Path) -> Stored:
@@ -67,14 +75,15 @@ def load_agent(path: str | Path) -> Stored:
     return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
 
 
-def save_agent(stored: Stored, directory: Path) -> None:
-    """Writes a shipped agent: float32 arrays by name, the configuration and the facts."""
+def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None = None) -> None:
+    """Writes a shipped agent: float32 arrays by name, the configuration and the facts, its score among them."""
     directory.mkdir(parents=True, exist_ok=True)
     arrays = named((stored.params, stored.statistics))
     save_file(arrays, directory / _PARAMETERS)
     config = to_mapping(stored.agent.config)
     (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-    save_facts(stored.agent, directory, env_steps=stored.env_steps)
+    known = {} if score is None else {"score": dict(score)}
+    save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
 
 
 def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
@@ -99,18 +108,28 @@ def named(tree) -> dict:
     return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named.items()}
 
 
+def _read_score(file: Path) -> dict[str, Any]:
+    try:
+        result = json.loads(file.read_text())
+        return {key: result[key] for key in ("mean", "stderr", "episodes", "policy")}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ConfigError(f"score={file}: accepted is a file that evaluate json=<file> has written") from None
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What the command takes."""
 
     run: str
     out: str
+    score: str | None = None  # file that `evaluate json=` has written, to go with the agent
 
 
 def export(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
-    save_agent(load_agent(options.run), Path(options.out))
+    score = None if options.score is None else _read_score(Path(options.score))
+    save_agent(load_agent(options.run), Path(options.out), score)
     print(f"{options.out}: {_PARAMETERS}, config.yaml, {_FACTS}")
 
 

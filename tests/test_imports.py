@@ -54,6 +54,8 @@ WORLD = {
 # Where the two meet: the loop that acts, and the commands around a trained agent.
 MEETING = {
     "cost",
+    "curves",
+    "demo",
     "drawing",
     "dump",
     "evaluate",
@@ -66,6 +68,7 @@ MEETING = {
     "report",
     "rollout",
     "scene",
+    "scores",
     "show",
     "store",
     "train",

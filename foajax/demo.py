@@ -1,0 +1,85 @@
+"""`python -m foajax.demo`: a shipped agent plays one game, with nothing to train, and its page to watch.
+
+The best agent in agents/ for the game, by the score that it was shipped with.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+
+from foajax import cli
+from foajax.config import ConfigError
+from foajax.player import write_page
+from foajax.render import make_directory, play, progress_bar
+from foajax.rundir import load_config
+from foajax.store import load_agent, load_score
+from foajax.train import use_compilation_cache
+
+_FIRST = ("breakout", "pong")  # what is played where no game is asked for
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    game: str | None = None  # null for breakout, else pong, else any that an agent is shipped for
+    out: str = "demo"  # directory of the page
+    seed: int = 0
+    steps: int = 9000  # at most: ten minutes of an Atari game
+    open: bool = False  # whether to show the page in the browser
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ConfigError(f"steps={self.steps}: accepted is an integer >= 1")
+
+
+def agents() -> Path:
+    """agents/: inside the package when installed from a wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    inside = package / "agents"
+    return inside if inside.is_dir() else package.parent / "agents"
+
+
+def choose(directory: Path, game: str | None) -> Path:
+    """The best agent for a game, by its mean score.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    shipped: dict[str, list[Path]] = {}
+    for file in sorted(directory.glob("*/config.yaml")):
+        shipped.setdefault(load_config(file.parent).game, []).append(file.parent)
+    if not shipped:
+        raise ConfigError("demo: no agent is shipped yet; python -m foajax.player run=<dir> shows one of your own")
+    asked = game or next((name for name in _FIRST if name in shipped), min(shipped))
+    if asked not in shipped:
+        raise ConfigError(f"game={asked}: no agent is shipped for it; accepted is one of {', '.join(shipped)}")
+    return max(shipped[asked], key=lambda path: (load_score(path) or {}).get("mean", -math.inf))
+
+
+def demo(arguments: Sequence[str]) -> None:
+    """The command; prints the score and the page's path."""
+    options = cli.parse(Options, arguments)
+    path = choose(agents(), options.game)
+    stored, directory = load_agent(path), make_directory(options.out)
+    use_compilation_cache()
+    with progress_bar() as bar:
+        recording = next(play(stored, bar, seed=options.seed, greedy=False, max_steps=options.steps))
+    page = write_page(recording, directory)
+    ended = "game over" if recording.is_over else "cut"
+    print(f"{path.name}: {recording.score[-1]:g} points in {len(recording.score):,} steps ({ended})")
+    if score := load_score(path):
+        error = "" if score["stderr"] is None else f" +- {score['stderr']:.1f}"
+        print(f"its evaluation: {score['mean']:.1f}{error} over {score['episodes']} games ({score['policy']} actions)")
+    print(f"watch it: {page.resolve().as_uri()}")
+    if options.open:
+        webbrowser.open(page.resolve().as_uri())
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(demo))
