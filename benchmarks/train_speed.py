@@ -38,9 +38,9 @@ from foajax.agent import Agent
 from foajax.allocator import keep_memory
 from foajax.compose import compose
 from foajax.config import Config, ConfigError
-from foajax.programs import make_programs, make_state
+from foajax.programs import make_programs, make_state, use_compilation_cache
 from foajax.rollout import Collector, update_on
-from foajax.train import make_environments, use_compilation_cache
+from foajax.train import make_environments
 
 PARTS = ("env_only", "act_only", "update_only", "end_to_end")
 

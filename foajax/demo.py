@@ -15,10 +15,10 @@ from pathlib import Path
 from foajax import cli
 from foajax.config import ConfigError
 from foajax.player import write_page
+from foajax.programs import use_compilation_cache
 from foajax.render import make_directory, play, progress_bar
 from foajax.rundir import load_config
 from foajax.store import load_agent, load_score
-from foajax.train import use_compilation_cache
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
 

@@ -26,6 +26,7 @@ from foajax.envs import steps_per_second
 from foajax.foveation import ring_boxes
 from foajax.gaze import NAMES
 from foajax.painting import packed, tables
+from foajax.programs import use_compilation_cache
 from foajax.recording import Recording
 from foajax.render import make_directory, play, progress_bar
 from foajax.store import load_agent
@@ -187,6 +188,7 @@ def _shrunk(recording: Recording) -> tuple[int, int]:
 def player(arguments: Sequence[str]) -> None:
     """The command; prints the path of the page."""
     options = cli.parse(Options, arguments)
+    use_compilation_cache()
     stored, directory = load_agent(options.run), make_directory(options.out)
     with progress_bar() as bar:
         greedy = options.policy == "greedy"

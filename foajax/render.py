@@ -22,6 +22,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from foajax import cli, heatmap
 from foajax.config import ConfigError
 from foajax.envs import steps_per_second
+from foajax.programs import use_compilation_cache
 from foajax.recording import Recording, record
 from foajax.scene import Scene
 from foajax.store import Stored, load_agent
@@ -116,6 +117,7 @@ def progress_bar() -> Progress:
 def render(arguments: Sequence[str]) -> None:
     """The command; prints the paths of what it wrote."""
     options = cli.parse(Options, arguments)
+    use_compilation_cache()
     stored = load_agent(options.run)
     directory = make_directory(options.out or Path(options.run) / "render")
     suffix = options.format or ("mp4" if _has_ffmpeg() else "gif")

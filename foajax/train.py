@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import signal
 import sys
 import time
@@ -23,13 +22,15 @@ from foajax.config import Config, ConfigError
 from foajax.dump import Dump
 from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
-from foajax.programs import make_programs, make_state
+from foajax.programs import make_programs, make_state, use_compilation_cache
 from foajax.rollout import Collector, update_on
 from foajax.rundir import RunDir, open_run
+from foajax.snapshots import snapshots
 from foajax.store import CHECKPOINTS, save_facts
 from foajax.types import Outcome
 from foajax.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 
+_PICTURES_EVERY = 900.0  # seconds
 _GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best
 
 
@@ -100,6 +101,7 @@ class Run:
     def _loop(self, stop: StopRequest) -> None:
         train = self._config.train
         logged = saved = time.monotonic()
+        pictured = -math.inf
         metrics: list[Metrics] = []
         while self._env_steps < train.env_steps and stop.name is None:
             step = self._env_steps // self._config.env.num_envs
@@ -113,6 +115,10 @@ class Run:
             if self._dump:
                 self._dump.remember(self._env_steps, self._state.params, rollouts)
             self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
+            if now - pictured >= _PICTURES_EVERY:
+                for tag, image in snapshots(rollouts[0], self._config.env.frame_shape).items():
+                    self._logger.image(tag, image)
+                pictured = now
             self._track(outcomes)
             self._env_steps += self._rollout_steps
             self._games = self._collector.get_state()
@@ -228,13 +234,6 @@ def make_environments(config: Config, env_steps: int) -> list[envs.Environment]:
     batch = config.env.num_envs // config.env.groups
     seeds = [environment_seed(config.seed, env_steps, group) for group in range(config.env.groups)]
     return [envs.make(config, num_envs=batch, seed=seed) for seed in seeds]
-
-
-def use_compilation_cache() -> None:
-    """Compiled programs are kept for the next start, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        jax.config.update("jax_compilation_cache_dir", os.path.join(cache, "foajax"))
 
 
 def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:

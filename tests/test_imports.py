@@ -70,6 +70,7 @@ MEETING = {
     "scene",
     "scores",
     "show",
+    "snapshots",
     "store",
     "train",
     "wrapper",

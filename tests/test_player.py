@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import browser_needed, opened_page
 
 from foajax import cli, player
 from foajax.painting import packed, paint, tables
 from foajax.recording import Screens
 
 ARTEFACTS = Path(__file__).resolve().parent.parent / "build"
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-FLAGS = [
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync"),
-]
-browser_needed = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)"
-)
-
 GAZE = """() => {  // centre of all that is drawn in the colour of the focal point, in CSS pixels
   const canvas = document.getElementById("gaze"), ratio = canvas.width / canvas.clientWidth;
   const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -41,22 +32,10 @@ PIXELS = """id => {
 
 @contextlib.contextmanager
 def opened(file):
-    """The page in a new browser. Ends with an error if the page complained or asked for anything else."""
-    from playwright.sync_api import sync_playwright
-
-    complaints, requests = [], []
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(viewport={"width": 1366, "height": 768})
-        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: requests.append(request.url))
-        page.goto(file.as_uri())
+    """A player that shows its first step."""
+    with opened_page(file) as page:
         page.wait_for_function("document.body.dataset.shown === '0'")
         yield page
-        browser.close()
-    assert complaints == []
-    assert [url for url in requests if not url.startswith(("data:", "blob:"))] == [file.as_uri()]
 
 
 def go(page, step):

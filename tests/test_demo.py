@@ -1,0 +1,70 @@
+"""The demo: which shipped agent it takes, and a game from its files alone."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from foajax import cli, demo, store
+
+EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}
+
+
+@pytest.fixture
+def shipped(breakout_agent, tmp_path, monkeypatch):
+    """Two agents for Breakout, and one that is said to play Pong and has no score."""
+    directory = tmp_path / "agents"
+    store.save_agent(breakout_agent, directory / "poor", EVALUATED | {"mean": 2.0})
+    store.save_agent(breakout_agent, directory / "good", EVALUATED)
+    store.save_agent(breakout_agent, directory / "untold")
+    config = directory / "untold" / "config.yaml"
+    config.write_text(config.read_text().replace("game: breakout", "game: pong"))
+    monkeypatch.setattr(demo, "agents", lambda: directory)
+    return directory
+
+
+def test_the_best_agent_of_a_game_is_taken(shipped):
+    assert demo.choose(shipped, None).name == demo.choose(shipped, "breakout").name == "good"
+    assert demo.choose(shipped, "pong").name == "untold"
+
+
+def test_it_plays(shipped, tmp_path, capsys):
+    assert cli.run(demo.demo, ["steps=40", f"out={tmp_path / 'out'}"]) == 0
+    page = tmp_path / "out" / "index.html"
+    *_, played, evaluated, watch = capsys.readouterr().out.splitlines()
+    assert played.startswith("good: ") and played.endswith(" points in 40 steps (cut)")
+    assert evaluated == "its evaluation: 9.0 +- 0.5 over 30 games (sampled actions)"
+    assert watch == f"watch it: {page.as_uri()}" and page.stat().st_size > 50_000
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["game=chess"], "game=chess: no agent is shipped for it; accepted is one of breakout, pong"),
+        (["steps=0"], "steps=0: accepted is an integer >= 1"),
+    ],
+)
+def test_a_mistake_is_one_line(shipped, words, message, capsys):
+    assert cli.run(demo.demo, words) == 2
+    assert capsys.readouterr().err == f"foajax: error: {message}\n"
+
+
+def test_nothing_shipped_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "agents", lambda: tmp_path)
+    assert cli.run(demo.demo, []) == 2
+    assert capsys.readouterr().err.startswith("foajax: error: demo: no agent is shipped yet")
+
+
+def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
+    (tmp_path / "score.json").write_text(json.dumps(EVALUATED | {"returns": [9.0], "seed": 0}))
+    words = [f"run={shipped / 'untold'}", f"out={tmp_path / 'again'}"]
+    assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 0
+    assert store.load_score(tmp_path / "again") == EVALUATED and store.load_score(shipped / "untold") is None
+    (tmp_path / "score.json").write_text("{}")
+    assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 2
+    assert "accepted is a file that evaluate json=<file> has written" in capsys.readouterr().err
+
+
+def test_agents_are_beside_a_checkout():
+    assert demo.agents().name == "agents" and (demo.agents() / "README.md").exists()

@@ -1,0 +1,143 @@
+"""The report: which runs belong together, what the curves say, and a page that needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+import yaml
+from browser import browser_needed, opened_page
+from PIL import Image
+
+from foajax import cli, curves, heatmap, report
+from foajax.compose import compose
+from foajax.config import to_mapping
+from foajax.heatmap import HeatMap
+
+SMALL = ["network.dense=8", "network.lstm=8"]
+
+
+def make_run(directory, name, *, words, scores, step=1000, seconds=60.0):
+    """A run's directory with a row every `step` env_steps, and none of the rest."""
+    run = directory / name
+    run.mkdir()
+    (run / "config.yaml").write_text(yaml.safe_dump(to_mapping(compose([*words, *SMALL]))))
+    rows = [{"env_steps": 0, "time": 0.0, "score": None}]
+    rows += [{"env_steps": step * i, "time": seconds * i, "score": s} for i, s in enumerate(scores, 1)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return run
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two experiments with two seeds each on seek, one of them evaluated."""
+    for seed in (0, 1):
+        words = ["game=seek", f"seed={seed}"]
+        plain = [*words, "experiment=constant50_sub2_packed"]
+        make_run(tmp_path, f"plain-{seed}", words=plain, scores=[0.0, 1.0 + seed, 2.0 + 2 * seed])
+        periphery = [*words, "experiment=constant70_p_packed", "learner.learning_rate=1e-3"]
+        make_run(tmp_path, f"periphery-{seed}", words=periphery, scores=[1.0, 5.0, 6.0 + seed])
+    (tmp_path / "plain-0" / "score.json").write_text(json.dumps({"mean": 11.0, "episodes": 30}))
+    return sorted(tmp_path.iterdir())
+
+
+def test_a_band_is_the_mean_where_all_seeds_have_scores(tmp_path):
+    one = make_run(tmp_path, "a", words=["game=seek"], scores=[0.0, 10.0, 20.0])
+    two = make_run(tmp_path, "b", words=["game=seek", "seed=1"], scores=[30.0, 30.0])
+    band = curves.band([curves.read_run(one), curves.read_run(two)], "env_steps")
+    assert (band.x[0], band.x[-1]) == (1000, 2000)
+    np.testing.assert_allclose([band.mean[0], band.mean[-1]], [15, 20])
+    np.testing.assert_allclose([band.low[0], band.high[0]], [0, 30])  # either seed twice, each in 1 of 4 resamples
+    assert curves.band([curves.read_run(one), curves.read_run(two)], "time").x[-1] == 120
+
+
+def test_seeds_are_grouped_and_final_scores_are_the_evaluated_ones(runs):
+    games = report.games_of(map(curves.read_run, runs), None)
+    assert {game: {name: len(seeds) for name, seeds in groups.items()} for game, groups in games.items()} == {
+        "seek": {"constant70_p_packed": 2, "constant50_sub2_packed": 2}
+    }
+    scores = report.final_scores(games["seek"])
+    assert scores["constant50_sub2_packed"].value == pytest.approx((11.0 + 4.0) / 2)
+    assert scores["constant70_p_packed"].value == pytest.approx(6.5)
+    assert report.all_games(games) == {}  # one game needs no normalising
+
+
+def test_all_games_are_normalised_and_only_for_who_played_all(tmp_path):
+    for game, score in (("seek", 6.0), ("pong", 14.6)):
+        make_run(tmp_path, game, words=[f"game={game}"], scores=[score])
+    make_run(tmp_path, "other", words=["game=pong", "experiment=nonfoa"], scores=[0.0])
+    games = report.games_of(map(curves.read_run, sorted(tmp_path.iterdir())), None)
+    together = report.all_games(games)
+    assert list(together) == ["constant70"]
+    assert together["constant70"].value == pytest.approx((0.5 + 1) / 2)
+
+
+def test_a_preset_has_the_papers_order_and_names(tmp_path):
+    for name in ("constant70", "nonfoa", "decreasing", "constant50_sub1_packed"):
+        make_run(tmp_path, name, words=["game=seek", f"experiment={name}"], scores=[1.0])
+    every = [curves.read_run(run) for run in sorted(tmp_path.iterdir())]
+    assert list(report.games_of(every, "constant")["seek"]) == [
+        "Non-FoA, sub1",
+        "Constant 50x50, sub1, packed",
+        "Constant 70x70, sub2",
+    ]
+    assert list(report.games_of(every, "decreasing")["seek"]) == ["Constant 70x70, sub2", "Decreasing 30-50-70"]
+
+
+def test_the_page(runs, tmp_path, capsys):
+    heat = HeatMap(np.eye(80, dtype=int), np.zeros((80, 80)), np.array([0, 0]), np.array([79, 79]), 4)
+    (runs[0] / "render").mkdir()
+    heatmap.save(heat, runs[0] / "render", "one")
+    (runs[0] / "render" / "episode-0.mp4").write_bytes(b"")
+    out = tmp_path / "report"
+    words = [*map(str, runs), f"out={out}", "episodes=0", "repeats=1"]
+    assert cli.run(report.report, words) == 0
+    assert capsys.readouterr().out.strip() == str(out / "index.html")
+    for name in ("curves-seek.png", "scores.png", f"heatmap-{runs[0].name}.png"):
+        with Image.open(out / name) as image:
+            assert min(image.size) > 200
+    page = (out / "index.html").read_text()
+    assert not re.search(r"""(src|href)=["'](?!data:|\.\./)""", page)  # nothing from elsewhere, links but to the runs
+    assert page.count('src="data:image/') == 3
+    assert '<a href="../periphery-0/render/episode-0.mp4">' in page
+    assert "<td>constant50_sub2_packed</td>" in page and "7.5 [4, 11]" in page
+    assert "<td><code>learner.learning_rate</code></td><td>0.001</td><td>0.0003</td>" in page
+    assert re.search(r"<td class=\"number\">625</td><td class=\"number\">10 %</td>", page)
+
+
+@browser_needed
+def test_the_page_is_whole_in_a_browser(runs, tmp_path):
+    assert cli.run(report.report, [*map(str, runs), f"out={tmp_path / 'r'}", "episodes=0", "repeats=0"]) == 0
+    with opened_page(tmp_path / "r" / "index.html") as page:
+        assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 100)")
+        assert page.locator("h2").all_inner_texts()[:3] == ["At a glance", "Learning curves", "Final scores"]
+
+
+def test_runs_that_differ_need_names_that_differ(tmp_path):
+    one = make_run(tmp_path, "a", words=["game=seek"], scores=[1.0])
+    two = make_run(tmp_path, "b", words=["game=seek", "seed=1", "learner.learning_rate=1e-3"], scores=[1.0])
+    with pytest.raises(report.ConfigError, match="differs in learner.learning_rate from that of"):
+        report.games_of(map(curves.read_run, (one, two)), None)
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        ([], "no runs: accepted is report"),
+        (["nowhere"], "run=nowhere: does not exist"),
+        (["nowhere", "preset=all"], "preset=all: accepted is one of constant, decreasing, peripheral or null"),
+        (["nowhere", "episodes=-1"], "episodes=-1: accepted is an integer >= 0"),
+    ],
+)
+def test_a_mistake_is_one_line(words, message, capsys):
+    assert cli.run(report.report, words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"foajax: error: {message}") and error.count("\n") == 1
+
+
+def test_a_run_without_scores_is_one_line(tmp_path, capsys):
+    run = make_run(tmp_path, "new", words=["game=seek"], scores=[])
+    assert cli.run(report.report, [str(run)]) == 2
+    assert "no game has ended in it yet" in capsys.readouterr().err
