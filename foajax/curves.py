@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,12 +68,13 @@ def read_run(path: str | Path) -> RunData:
     return RunData(path, config, env_steps, time, score, evaluation)
 
 
-def band(runs: Sequence[RunData], axis: str) -> Band:
-    """The mean curve over seeds where all of them have one, with a bootstrap interval at each point."""
+def band(runs: Sequence[RunData], axis: str) -> Band | None:
+    """The mean curve over seeds where all have scores, with a bootstrap interval; None where that is nowhere."""
     xs = [getattr(run, axis) for run in runs]
-    x = np.linspace(
-        max(each[0] for each in xs), max(min(each[-1] for each in xs), max(each[0] for each in xs)), _POINTS
-    )
+    first, last = max(each[0] for each in xs), min(each[-1] for each in xs)
+    if first >= last:
+        return None
+    x = np.linspace(first, last, _POINTS)
     curves = np.stack([np.interp(x, each, run.score) for each, run in zip(xs, runs, strict=True)])
     drawn = np.random.default_rng(0).integers(0, len(runs), (RESAMPLES, len(runs)))
     means = curves[drawn].mean(axis=1)
@@ -81,14 +82,19 @@ def band(runs: Sequence[RunData], axis: str) -> Band:
     return Band(x, curves.mean(axis=0), low, high)
 
 
-def draw_curves(groups: Mapping[str, Sequence[RunData]], title: str) -> Figure:
+def colours_of(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each name, the same in all figures of a report."""
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(dict.fromkeys(names))}
+
+
+def draw_curves(groups: Mapping[str, Sequence[RunData]], title: str, colours: Mapping[str, str]) -> Figure:
     """Score against steps and against time; a colour for each group of seeds, every seed thin."""
     with rc_context(STYLE):
         figure = Figure(figsize=(10.4, 4.1), layout="constrained")
         plots = figure.subplots(1, 2, sharey=True)
         for plot, (axis, (unit, label)) in zip(plots, AXES.items(), strict=True):
-            for colour, (name, runs) in zip(_cycle(len(groups)), groups.items(), strict=True):
-                _draw_group(plot, runs, axis, unit, colour, name)
+            for name, runs in groups.items():
+                _draw_group(plot, runs, axis, unit, colours[name], name)
             plot.set_xlabel(label)
             plot.set_xlim(left=0)
             plot.grid(axis="y", color="#e6e6e6", linewidth=0.8)
@@ -104,18 +110,22 @@ def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, colo
     if len(runs) > 1:
         for run in runs:
             plot.plot(getattr(run, axis) / unit, run.score, color=colour, linewidth=0.6, alpha=0.45)
-        mean = band(runs, axis)
-        plot.fill_between(mean.x / unit, mean.low, mean.high, color=colour, alpha=0.16, linewidth=0)
-        plot.plot(mean.x / unit, mean.mean, color=colour, linewidth=2, label=f"{name} ({len(runs)} seeds)")
+        mean, label = band(runs, axis), f"{name} ({len(runs)} seeds)"
+        if mean is None:
+            plot.plot([], [], color=colour, linewidth=2, label=label)
+        else:
+            plot.fill_between(mean.x / unit, mean.low, mean.high, color=colour, alpha=0.16, linewidth=0)
+            plot.plot(mean.x / unit, mean.mean, color=colour, linewidth=2, label=label)
     else:
         plot.plot(getattr(runs[0], axis) / unit, runs[0].score, color=colour, linewidth=1.8, label=name)
 
 
-def draw_scores(intervals: Mapping[str, Mapping[str, Interval]]) -> Figure:
+def draw_scores(intervals: Mapping[str, Mapping[str, Interval]], colours: Mapping[str, str]) -> Figure:
     """Interquartile means with their intervals: a panel for each game, a row for each group.
 
     Args:
       intervals: of each group, by the panel's title.
+      colours: of the groups.
     """
     names = list(dict.fromkeys(name for panel in intervals.values() for name in panel))
     with rc_context(STYLE):
@@ -123,9 +133,9 @@ def draw_scores(intervals: Mapping[str, Mapping[str, Interval]]) -> Figure:
         figure = Figure(figsize=(width, 1.1 + 0.34 * len(names)), layout="constrained")
         plots = figure.subplots(1, len(intervals), sharey=True, squeeze=False)[0]
         for plot, (title, panel) in zip(plots, intervals.items(), strict=True):
-            for row, (colour, name) in enumerate(zip(_cycle(len(names)), names, strict=True)):
+            for row, name in enumerate(names):
                 if name in panel:
-                    score = panel[name]
+                    score, colour = panel[name], colours[name]
                     plot.barh(row, score.high - score.low, left=score.low, height=0.6, color=colour, alpha=0.3)
                     plot.plot([score.value] * 2, [row - 0.3, row + 0.3], color=colour, linewidth=2.5)
             plot.set_title(title, loc="left", fontweight="bold")
@@ -138,7 +148,3 @@ def draw_scores(intervals: Mapping[str, Mapping[str, Interval]]) -> Figure:
             plot.spines["left"].set_visible(False)
         figure.supxlabel(f"interquartile mean of the runs' scores, {100 * CONFIDENCE:.0f} % interval", fontsize=10)
     return figure
-
-
-def _cycle(count: int) -> list[str]:
-    return [COLOURS[i % len(COLOURS)] for i in range(count)]

@@ -14,7 +14,7 @@ from matplotlib import colormaps, rc_context
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from foajax import durable
 from foajax.config import Config, ConfigError
@@ -148,6 +148,7 @@ def draw(heat: HeatMap, title: str) -> Figure:
         axes[0].set_title(title, loc="left", fontweight="bold")
         axes[0].set_xlabel(heat.summary)
         colour_bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02)
+        colour_bar.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         colour_bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:g}"))
         colour_bar.ax.yaxis.set_minor_formatter(NullFormatter())
         colour_bar.set_label("focal point here, % of the steps")

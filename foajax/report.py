@@ -116,12 +116,16 @@ def final_scores(groups: Groups) -> dict[str, Interval]:
 def all_games(games: Mapping[str, Groups]) -> dict[str, Interval]:
     """The same over all games, where their scores can be compared, for the experiments that have played all of them."""
     result = {}
-    for name in dict.fromkeys(name for groups in games.values() for name in groups):
+    for name in _experiments(games):
         strata = [normalised(game, _finals(groups[name])) for game, groups in games.items() if name in groups]
         known = [scores for scores in strata if scores is not None]
         if len(known) == len(games) > 1:
             result[name] = interval(known, iqm)
     return result
+
+
+def _experiments(games: Mapping[str, Groups]) -> list[str]:
+    return list(dict.fromkeys(name for groups in games.values() for name in groups))
 
 
 def _finals(runs: Sequence[RunData]) -> np.ndarray:
@@ -204,11 +208,8 @@ def _add_summary(page: Page, games: Mapping[str, Groups], repeats: int) -> None:
             cells += [f"{record['decision_us_batch1'] / 1e3:.2f}"]
         rows.append(cells)
     head = ["game", "experiment", "runs", "env_steps", "hours", "score"]
-    head += (
-        ["values<br>shown", "of the<br>frame", "torso<br>MFLOP", "decision<br>MFLOP", "decision<br>ms"]
-        if repeats
-        else []
-    )
+    if repeats:
+        head += ["values<br>shown", "of the<br>frame", "torso<br>MFLOP", "decision<br>MFLOP", "decision<br>ms"]
     page.table(head, rows, numbers=range(2, len(head)))
     page.add(
         '<p class="note">Score: interquartile mean over runs [95 % interval], of evaluated games where a run has a '
@@ -218,8 +219,10 @@ def _add_summary(page: Page, games: Mapping[str, Groups], repeats: int) -> None:
 
 def _add_curves(page: Page, games: Mapping[str, Groups]) -> None:
     page.add("<h2>Learning curves</h2>")
+    colours = curves.colours_of(_experiments(games))
     for game, groups in games.items():
-        page.figure(curves.draw_curves(groups, game), f"curves-{_file_name(game)}", f"learning curves on {game}")
+        figure = curves.draw_curves(groups, game, colours)
+        page.figure(figure, f"curves-{_file_name(game)}", f"learning curves on {game}")
     note = "thin: single seeds; thick: their mean where all seeds have scores, with its 95 % bootstrap interval"
     page.add(f'<p class="note">Full games, unclipped ({note}).</p>')
 
@@ -230,7 +233,8 @@ def _add_scores(page: Page, games: Mapping[str, Groups]) -> None:
     if together := all_games(games):
         panels["all games, normalised"] = together
         page.add('<p class="note">Normalised: 0 is random play, 1 a human tester (in seek: who sees everything).</p>')
-    page.figure(curves.draw_scores(panels), "scores", "interquartile means of the final scores")
+    figure = curves.draw_scores(panels, curves.colours_of(_experiments(games)))
+    page.figure(figure, "scores", "interquartile means of the final scores")
 
 
 def _add_maps(page: Page, runs: Sequence[RunData], maps: Mapping[Path, HeatMap], directory: Path) -> None:
@@ -255,7 +259,7 @@ def _add_differences(page: Page, games: Mapping[str, Groups]) -> None:
             cells = [[f"<code>{html.escape(k)}</code>", *(html.escape(str(v)) for v in row)] for k, row in rows.items()]
             page.table([html.escape(game), *map(html.escape, groups)], cells)
         else:
-            page.add(f'<p class="note">{html.escape(game)}: in nothing but seeds.</p>')
+            page.add(f'<p class="note">{html.escape(game)}: in their seeds alone.</p>')
 
 
 def _add_runs(page: Page, runs: Sequence[RunData], directory: Path) -> None:
@@ -271,7 +275,7 @@ def _add_runs(page: Page, runs: Sequence[RunData], directory: Path) -> None:
 
 def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]:
     """Heat maps found in the runs' directories; of a group without any, its first run plays."""
-    maps = {}
+    maps: dict[Path, HeatMap] = {}
     for groups in games.values():
         for seeds in groups.values():
             found = {run.path: file for run in seeds if (file := run.path / "render" / heatmap.FILE).exists()}

@@ -122,6 +122,12 @@ def test_a_mistake_is_one_line(word, message, capsys):
     assert error.count("\n") == 1
 
 
+def test_a_run_of_its_own_is_measured():
+    config = compose(["sensor=rings", "sensor.rings=[[24,24,2]]", "name=mine", "network.dense=8", "network.lstm=8"])
+    (record,) = cost.measure_decisions([config], repeats=2)
+    assert record["experiment"] == "mine" and record["pixels_actual"] == 576 and record["decision_us_batch1"] > 1
+
+
 def test_calls_take_turns_and_the_median_counts(monkeypatch):
     order, clock = [], iter([0, 1, 0, 9, 0, 2, 0, 9, 0, 30, 0, 9])
     monkeypatch.setattr(cost.time, "perf_counter", lambda: next(clock))

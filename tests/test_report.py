@@ -51,6 +51,8 @@ def test_a_band_is_the_mean_where_all_seeds_have_scores(tmp_path):
     np.testing.assert_allclose([band.mean[0], band.mean[-1]], [15, 20])
     np.testing.assert_allclose([band.low[0], band.high[0]], [0, 30])  # either seed twice, each in 1 of 4 resamples
     assert curves.band([curves.read_run(one), curves.read_run(two)], "time").x[-1] == 120
+    late = make_run(tmp_path, "c", words=["game=seek", "seed=2"], scores=[None, None, None, 1.0])
+    assert curves.band([curves.read_run(two), curves.read_run(late)], "time") is None  # none in common
 
 
 def test_seeds_are_grouped_and_final_scores_are_the_evaluated_ones(runs):
@@ -86,7 +88,13 @@ def test_a_preset_has_the_papers_order_and_names(tmp_path):
     assert list(report.games_of(every, "decreasing")["seek"]) == ["Constant 70x70, sub2", "Decreasing 30-50-70"]
 
 
-def test_the_page(runs, tmp_path, capsys):
+def test_the_page(runs, tmp_path, capsys, monkeypatch):
+    counted = {"pixels_actual": 625, "pixels_ratio": 0.0977, "torso_flops": 12e6, "decision_flops": 13e6}
+    monkeypatch.setattr(
+        report.cost,
+        "measure_decisions",
+        lambda configs, repeats: [counted | {"decision_us_batch1": 950.0}] * len(configs),
+    )
     heat = HeatMap(np.eye(80, dtype=int), np.zeros((80, 80)), np.array([0, 0]), np.array([79, 79]), 4)
     (runs[0] / "render").mkdir()
     heatmap.save(heat, runs[0] / "render", "one")

@@ -36,7 +36,10 @@ def test_a_run_leaves_everything_that_it_promises(breakout):
     assert rows(run)[-1]["env_steps"] == 1000
     for name in ("natural_entropy", "vision_entropy", "loss", "grad_norm", "score", "time"):
         assert name in rows(run)[-1]
-    assert (run / "config.yaml").exists() and list((run / "tensorboard").iterdir())
+    assert (run / "config.yaml").exists()
+    events = b"".join(file.read_bytes() for file in (run / "tensorboard").iterdir())
+    assert events.count(b"gaze/heat_map") == events.count(b"gaze/views") == 1  # the first one; the next is due later
+    assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 800
     assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 1000
     assert json.loads((run / "run.json").read_text())["starts"][0]["packages"]["envpool"]
 
