@@ -125,7 +125,7 @@ def test_a_mistake_is_one_line(word, message, capsys):
 def test_a_run_of_its_own_is_measured():
     config = compose(["sensor=rings", "sensor.rings=[[24,24,2]]", "name=mine", "network.dense=8", "network.lstm=8"])
     (record,) = cost.measure_decisions([config], repeats=2)
-    assert record["experiment"] == "mine" and record["pixels_actual"] == 576 and record["decision_us_batch1"] > 1
+    assert record["experiment"] == "mine" and record["pixels_actual"] == 144 and record["decision_us_batch1"] > 1
 
 
 def test_calls_take_turns_and_the_median_counts(monkeypatch):
