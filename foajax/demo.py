@@ -30,7 +30,7 @@ class Options:
     game: str | None = None  # null for breakout, else pong, else any that an agent is shipped for
     out: str = "demo"  # directory of the page
     seed: int = 0
-    steps: int = 9000  # at most: ten minutes of an Atari game
+    steps: int = 6000  # at most: nearly seven minutes of an Atari game, played in less than one
     open: bool = False  # whether to show the page in the browser
 
     def __post_init__(self) -> None:
