@@ -39,7 +39,6 @@ def test_a_run_leaves_everything_that_it_promises(breakout):
     assert (run / "config.yaml").exists()
     events = b"".join(file.read_bytes() for file in (run / "tensorboard").iterdir())
     assert events.count(b"gaze/heat_map") == events.count(b"gaze/views") == 1  # the first one; the next is due later
-    assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 800
     assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 1000
     assert json.loads((run / "run.json").read_text())["starts"][0]["packages"]["envpool"]
 
