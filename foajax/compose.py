@@ -6,15 +6,17 @@ left to the functions that need them.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import functools
 import itertools
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from foajax import cli
+from foajax import cli, sweep
 from foajax.config import Config, ConfigError, from_mapping
 
 Task = Callable[[Config], int | None]  # returns an exit code, None for 0
@@ -47,26 +49,66 @@ def list_experiments() -> list[str]:
 def run(task: Task, arguments: Sequence[str]) -> int:
     """Runs `task` on the config that the command line describes; returns the exit code.
 
-    A single run is composed and started directly. Flags (`--multirun`, `--help`, `--cfg`) are Hydra's; every
-    run of a sweep is checked before the first one starts, and the first one that fails ends the sweep. A
-    `ConfigError`, one that `task` raises included, becomes one line on stderr and exit code 2.
+    A single run is composed and started directly. `--multirun` alone runs a sweep on this machine, a process of
+    `foajax.train` each, `--jobs=N` at a time (1). With a `hydra/launcher` (`submitit_slurm`; `basic` for one after
+    another in this process) Hydra starts `task` for each run, and other flags (`--help`, `--cfg`) are Hydra's. Every
+    run of a sweep is checked before the first one starts; one that fails does not end the sweep.
+
+    A `ConfigError`, one that `task` raises included, becomes one line on stderr and exit code 2.
     """
     if any(word.startswith("-") for word in arguments):
-        return cli.run(functools.partial(_run_hydra, task), arguments)
+        return cli.run(functools.partial(_run_flags, task), arguments)
     return cli.run(lambda words: task(compose(words)), arguments)
 
 
-def _run_hydra(task: Task, arguments: Sequence[str]) -> int:
+def _run_flags(task: Task, arguments: Sequence[str]) -> int:
+    ours = [word for word in arguments if "=" in word and not word.startswith(("-", "hydra.", "hydra/"))]
+    runs = _expand(ours)
+    rest = [word for word in arguments if word not in ours]
+    is_sweep = not {"-m", "--multirun"}.isdisjoint(rest)
+    jobs = [word for word in rest if word.startswith("--jobs")]
+    at_a_time = _jobs(*jobs)
+    if is_sweep and not set(rest) - {"-m", "--multirun", *jobs}:
+        return sweep.run_all(runs, jobs=at_a_time)
+    if jobs:
+        raise ConfigError(f"{jobs[0]}: accepted only together with --multirun, and without a hydra/launcher")
+    failures: dict[str, str] = {}
+    swept = {_parse(word).key_or_group for word in ours if _parse(word).is_sweep_override()} if is_sweep else None
+    words = [_checked(word, sweep=True) if word in ours else word for word in arguments]
+    code = _run_hydra(lambda node: _job(task, swept, failures, node), words)
+    return sweep.summarise([run.config for run in runs], failures) or code if is_sweep else code
+
+
+def _jobs(word: str = "--jobs=1", *more: str) -> int:
+    number = word.partition("=")[2]
+    if more or not number.isdecimal() or int(number) < 1:
+        raise ConfigError(f"{_one_line(word, *more)}: accepted is --jobs=N, how many runs at a time")
+    return int(number)
+
+
+def _job(task: Task, swept: set[str] | None, failures: dict[str, str], node: Any) -> None:
+    """One run that Hydra starts, maybe in another process; `swept` are the keys of a sweep."""
+    from hydra.core.hydra_config import HydraConfig
+
+    config = _config(node)
+    if swept is None:
+        if code := cli.run(lambda _: task(config), ()):
+            raise SystemExit(code)  # Hydra drops what a job returns
+        return
+    config = _named(config, HydraConfig.get().overrides.task, swept)
+    if sweep.skip_if_finished(config):
+        return
+    try:
+        if code := cli.run(lambda _: task(config), ()):
+            failures[config.run_dir] = f"exit {code}"
+    except Exception as error:  # whatever it is, the next run starts
+        failures[config.run_dir] = "exit 1"
+        sys.excepthook(type(error), error, error.__traceback__)
+
+
+def _run_hydra(job: Callable[[Any], None], words: Sequence[str]) -> int:
     import hydra
 
-    ours = [word for word in arguments if "=" in word and not word.startswith(("-", "hydra.", "hydra/"))]
-    _check_sweep(ours)
-
-    def job(node: Any) -> None:
-        if code := cli.run(lambda _: task(_config(node)), ()):
-            raise SystemExit(code)  # Hydra drops what a job returns
-
-    words = [_checked(word, sweep=True) if word in ours else word for word in arguments]
     before = sys.argv
     sys.argv = [before[0], *words]  # hydra.main takes its arguments from nowhere else
     try:
@@ -78,15 +120,29 @@ def _run_hydra(task: Task, arguments: Sequence[str]) -> int:
     return 0
 
 
-def _check_sweep(words: Sequence[str]) -> None:
-    """Composes every run of a sweep, so that a mistake in the last one does not show hours later."""
-    taken: set[str] = set()
+def _expand(words: Sequence[str]) -> list[sweep.Run]:
+    """Every run of a sweep, checked, so that a mistake in the last one does not show hours later."""
+    swept = {_parse(word).key_or_group for word in words if _parse(word).is_sweep_override()}
+    runs: dict[str, sweep.Run] = {}
     for overrides in itertools.product(*map(_values, words)):
-        config = compose(overrides)
-        if config.run_dir in taken:
+        plain = compose(overrides)
+        config = _named(plain, overrides, swept)
+        if config.run_dir in runs:
             accepted = "a directory for each, as with 'name=constant70-${gaze.mode}'"
             raise ConfigError(f"run={config.run_dir}: two runs would share it; accepted is {accepted}")
-        taken.add(config.run_dir)
+        name = [] if config == plain else [f"name='{config.name}'"]
+        runs[config.run_dir] = sweep.Run((*overrides, *name), config)
+    return list(runs.values())
+
+
+def _named(config: Config, overrides: Iterable[str], swept: set[str]) -> Config:
+    """`config` with a name that tells what the sweep chose, unless the choices name the directory already."""
+    known = {"experiment", "game", "seed", "name", "run"}
+    parsed = {override.key_or_group: override for override in map(_parse, overrides)}
+    if {"name", "run"} & parsed.keys():
+        return config
+    chosen = [f"{key}={parsed[key].get_value_string()}" for key in parsed if key in swept - known]
+    return dataclasses.replace(config, name="-".join([config.name, *(re.sub(r"[^\w.=+-]+", "-", c) for c in chosen)]))
 
 
 def _checked(word: str, *, sweep: bool) -> str:

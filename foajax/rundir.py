@@ -3,12 +3,14 @@
     config.yaml   the resolved configuration
     run.json      every start: command, versions, commit, machine, time
     lock          locked by the process that trains; names it
+    failure.txt   why the last start failed, where it did
 
 Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (checkpoint).
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import fcntl
@@ -18,6 +20,7 @@ import os
 import platform
 import socket
 import subprocess
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,8 @@ from foajax import durable
 from foajax.config import Config, ConfigError, from_mapping, to_mapping
 
 _CONFIG = "config.yaml"
+_RECORD = "run.json"
+_FAILURE = "failure.txt"
 _PACKAGES = (
     "foajax",
     "jax",
@@ -68,7 +73,10 @@ class RunDir:
     def __enter__(self) -> RunDir:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception):
+            with contextlib.suppress(OSError):
+                (self.path / _FAILURE).write_text(describe_error(error) + "\n", encoding="utf-8")
         self.close()
 
 
@@ -97,6 +105,7 @@ def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
     try:
         _settle_config(path, config)
         _record_start(path, command)
+        (path / _FAILURE).unlink(missing_ok=True)
     except OSError as error:
         run_dir.close()
         raise RunError(f"run={path}: cannot be used ({_reason(error)}); choose another run=<dir>") from None
@@ -134,13 +143,44 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     return dataclasses.replace(config, run=str(path))
 
 
+def is_run(path: Path) -> bool:
+    """Whether `path` is the directory of a run that has been started."""
+    return (path / _CONFIG).is_file() and (path / _RECORD).is_file()
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process has the run in `path` open, on this machine or on another that shares its files."""
+    try:
+        with (path / "lock").open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def failure(path: Path) -> str | None:
+    """Why the last start of the run in `path` failed, in one line; None where it did not."""
+    try:
+        return (path / _FAILURE).read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return None
+
+
+def describe_error(error: Exception) -> str:
+    """An error in one line: the text of what the user can mend, else its type as well."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}"
+
+
 def _take_lock(path: Path) -> int:
     try:
         lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
         raise RunError(f"run={path}: cannot be written ({_reason(error)}); choose another run=<dir>") from None
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(lock)
         os.ftruncate(lock, 0)
         os.write(lock, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
     except BlockingIOError:
@@ -153,22 +193,39 @@ def _take_lock(path: Path) -> int:
     return lock
 
 
+def _lock(descriptor: int) -> None:
+    """The kernel's lock; BlockingIOError where another process has it for longer than a look (`is_held`) takes."""
+    for wait in (0.01, 0.05, 0.2, None):
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if wait is None:
+                raise
+        time.sleep(wait)
+
+
 def _settle_config(path: Path, config: Config) -> None:
     """Writes ``config.yaml`` if it is new or differs in ways that may; RunError if in others."""
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     file = path / _CONFIG
     if os.path.lexists(file):
-        stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
-        # With a falling learning rate the length of the run is part of what a step learns.
-        free = _FREE - {"train.env_steps"} if config.learner.schedule == "linear" else _FREE
-        keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
-        if keys:
-            old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
-            remedy = "choose another run=<dir> or restore the value"
-            raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
+        check_same_run(path, config)
         if file.read_text(encoding="utf-8") == text:
             return
     durable.replace(file, text.encode())
+
+
+def check_same_run(path: Path, config: Config) -> None:
+    """RunError where the run in `path` differs from `config` in a key that changes what is learned."""
+    stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
+    # With a falling learning rate the length of the run is part of what a step learns.
+    free = _FREE - {"train.env_steps"} if config.learner.schedule == "linear" else _FREE
+    keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
+    if keys:
+        old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
+        remedy = "choose another run=<dir> or restore the value"
+        raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -185,7 +242,7 @@ def _show(value: Any) -> str:
 
 
 def _record_start(path: Path, command: Sequence[str]) -> None:
-    file = path / "run.json"
+    file = path / _RECORD
     try:
         record = json.loads(file.read_text(encoding="utf-8")) if os.path.lexists(file) else {"starts": []}
         record["starts"].append(_describe_start(command))

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from foajax import sweep
 from foajax.compose import compose, list_experiments, run
 from foajax.config import Config, ConfigError, HeadConfig, LogPolarSensor, RingSensor, to_mapping
 
@@ -29,6 +30,9 @@ TABLE_II = {
     "decreasing_p": ((70, 70), 1466, (5, 5)),
 }
 PACKED = [f"{name}_packed" for name in TABLE_II if name != "nonfoa"]
+
+
+HERE = ["--multirun", "hydra/launcher=basic"]  # one run after another in this process
 
 
 def nominal_values(sensor):
@@ -249,7 +253,7 @@ def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(cwd, runs, capsys, argu
 
 def test_a_sweep_runs_every_combination_in_order(cwd, runs):
     argv = list(sys.argv)
-    arguments = ["-m", "game=pong,seek", "experiment=glob(constant50_sub?)", "env.crop_top.pong=30"]
+    arguments = [*HERE, "game=pong,seek", "experiment=glob(constant50_sub?)", "env.crop_top.pong=30"]
     assert run(runs.record, arguments) == 0
     assert [(config.game, config.name) for config in runs] == [
         ("pong", "constant50_sub1"),
@@ -263,16 +267,69 @@ def test_a_sweep_runs_every_combination_in_order(cwd, runs):
     assert sys.argv == argv
 
 
-def test_the_first_run_that_fails_ends_a_sweep(cwd, runs):
-    assert run(runs.record, ["--multirun", "seed=0,5,6"]) == 5
-    assert [config.seed for config in runs] == [0, 5]
+def test_a_run_that_fails_does_not_end_a_sweep(cwd, runs, capsys):
+    assert run(runs.record, [*HERE, "seed=0,5,6", "game=seek,brekout"]) == 1
+    assert [config.seed for config in runs] == [0, 0, 5, 5, 6, 6]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if line.startswith("  failed: ")] == [
+        "  failed: runs/brekout-constant70-s0: exit 2",
+        "  failed: runs/seek-constant70-s5: exit 5",
+        "  failed: runs/brekout-constant70-s5: exit 2",
+        "  failed: runs/seek-constant70-s6: exit 6",
+        "  failed: runs/brekout-constant70-s6: exit 2",
+    ]
+
+
+def test_an_error_in_a_run_does_not_end_a_sweep(cwd, capsys):
+    def task(config):
+        return 1 // config.seed
+
+    assert run(task, [*HERE, "seed=0,1"]) == 1
+    err = capsys.readouterr().err
+    assert "ZeroDivisionError" in err and "runs/breakout-constant70-s0: exit 1" in err
+
+
+def test_what_a_sweep_chooses_names_its_runs(cwd, runs):
+    assert run(runs.record, [*HERE, "gaze=frozen,random", "learner.natural.gamma=0.9,0.99", "seed=0"]) == 0
+    assert [config.run_dir for config in runs] == [
+        f"runs/breakout-constant70-gaze={gaze}-learner.natural.gamma={gamma}-s0"
+        for gaze in ("frozen", "random")
+        for gamma in ("0.9", "0.99")
+    ]
+    assert [config.gaze.mode for config in runs] == ["frozen", "frozen", "random", "random"]
 
 
 def test_runs_of_a_sweep_may_not_share_a_directory(cwd, runs, capsys):
-    assert run(runs.record, ["-m", "gaze=frozen,random"]) == 2
+    assert run(runs.record, [*HERE, "gaze=frozen,random", "name=mine"]) == 2
     assert "two runs would share it" in capsys.readouterr().err
-    assert run(runs.record, ["-m", "gaze=frozen,random", "name=constant70-${gaze.mode}"]) == 0
+    run(runs.record, [*HERE, "gaze=frozen,random", "name=constant70-${gaze.mode}"])
     assert [config.name for config in runs] == ["constant70-frozen", "constant70-random"]
+
+
+def test_without_a_launcher_each_run_is_a_command_of_its_own(cwd, runs, monkeypatch):
+    started = []
+    monkeypatch.setattr(sweep, "run_all", lambda runs, *, jobs: started.append((runs, jobs)) or 0)
+    assert run(runs.record, ["-m", "gaze=frozen,random", "seed=3"]) == 0
+    assert run(runs.record, ["--multirun", "--jobs=4", "seed=0,1"]) == 0
+    (first, one), (_, four) = started
+    assert (one, four) == (1, 4) and runs == []
+    for member in first:
+        assert compose(member.words) == member.config
+    assert [member.config.gaze.mode for member in first] == ["frozen", "random"]
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (["-m", "--jobs=0"], "--jobs=0: accepted is --jobs=N"),
+        (["-m", "--jobs", "4"], "--jobs: accepted is --jobs=N"),
+        (["--jobs=2"], "--jobs=2: accepted only together with --multirun"),
+        ([*HERE, "--jobs=2"], "--jobs=2: accepted only together with --multirun"),
+    ],
+)
+def test_jobs_is_a_number_and_for_local_sweeps(cwd, runs, capsys, arguments, said):
+    assert run(runs.record, arguments) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_help_lists_the_experiments_and_cfg_prints_the_run(cwd, runs, capsys):

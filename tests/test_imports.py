@@ -28,6 +28,7 @@ CORE = [
         "optimizer",
         "recurrence",
         "returns",
+        "sharding",
     ),
     ("agent",),
     ("learner",),
@@ -41,6 +42,7 @@ WORLD = {
     "cli",
     "compose",
     "display",
+    "distributed",
     "durable",
     "envs",
     "gymnasium_env",
@@ -49,6 +51,8 @@ WORLD = {
     "probes",
     "rundir",
     "seek",
+    "status",
+    "sweep",
     "watchdog",
 }
 # Where the two meet: the loop that acts, and the commands around a trained agent.
