@@ -61,7 +61,7 @@ class Run:
         watchdog = Watchdog(config.env.timeout, abandon=self._abandon, is_saved=self._is_saved)
         resources.enter_context(watchdog)
         # Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it got.
-        make = watchdog.watched("making the environments", make_environments, patience=10)  # emulators load slowly
+        make = watchdog.watched("making the environments", make_environments, patience=10.0)  # emulators load slowly
         environments = make(config, self._env_steps)
         for group, environment in enumerate(environments):
             watchdog.watch(environment, f"environment group {group}")
