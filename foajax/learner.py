@@ -21,7 +21,7 @@ from foajax.types import Params, Rollout, TrainState
 Metrics = dict[str, Float[Array, ""]]
 
 
-def initial_state(agent: Agent, optimizer: optax.GradientTransformation, key: PRNGKeyArray) -> TrainState:
+def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs, key: PRNGKeyArray) -> TrainState:
     """State before the first update."""
     params = agent.initial_params(key)
     return TrainState(
@@ -147,7 +147,7 @@ def _head_loss(
 
 def update(
     agent: Agent,
-    optimizer: optax.GradientTransformation,
+    optimizer: optax.GradientTransformationExtraArgs,
     size: int,
     state: TrainState,
     rollout: Rollout,
@@ -156,20 +156,22 @@ def update(
 ) -> tuple[TrainState, Metrics]:
     """One optimiser step on minibatch `index` of a rollout.
 
-    Where the loss, the gradient or a new parameter is not finite, parameters and optimiser stay as they were and
-    the step is counted as skipped. Frames enter the running statistics on the first pass over a rollout only.
+    Where the loss or the gradient is not finite, parameters and optimiser stay as they were and the step is counted
+    as skipped. So it is where a new parameter is not, but there the optimiser's averages go on: they have seen a
+    finite gradient, and a step of theirs that is too large gets smaller. Frames enter the running statistics on the
+    first pass over a rollout only.
     """
     part = minibatch(rollout, index, size)
     gradient, metrics = jax.grad(loss, has_aux=True)(state.params, agent, part)
     grad_norm = optax.tree.norm(gradient)
-    change, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+    accept = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
+    change, opt_state = optimizer.update(gradient, state.opt_state, state.params, accept=accept)
     params = optax.apply_updates(state.params, change)
     param_norm = optax.tree.norm(params)
-    finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm) & jnp.isfinite(param_norm)
+    finite = accept & jnp.isfinite(param_norm)
+    params = jax.tree.map(lambda new, old: jnp.where(finite, new, old), params, state.params)
+    opt_state = opt_state._replace(count=state.opt_state.count + finite)
     most = agent.config.learner.max_grad_norm
-    params, opt_state = jax.tree.map(
-        lambda new, old: jnp.where(finite, new, old), (params, opt_state), (state.params, state.opt_state)
-    )
     steps = part.steps
     statistics = frames.update_statistics(
         state.statistics,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from foajax.config import ConfigError, LearnerConfig
 from foajax.types import Params
@@ -28,7 +28,7 @@ class AmsgradState(NamedTuple):
     nu_max: Params  # largest nu so far, element by element, before bias correction
 
 
-def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.GradientTransformation:
+def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.GradientTransformationExtraArgs:
     """The optimiser of a run: clipping by global norm, AMSGrad, learning rate.
 
     The rate of update n = 1, 2, .. is `learning_rate`, times max(0, 1 - (n - 1) / total_updates) where
@@ -54,7 +54,7 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
 
 def amsgrad(
     schedule: optax.Schedule, *, b1: float, b2: float, eps: float, max_grad_norm: float | None
-) -> optax.GradientTransformation:
+) -> optax.GradientTransformationExtraArgs:
     """AMSGrad (Reddi et al. 2018) in PyTorch's form.
 
     For update n = 1, 2, .. and gradient g, element by element:
@@ -65,6 +65,9 @@ def amsgrad(
         nu_max <- max(nu_max, nu)
         update  = -schedule(n - 1) / (1 - b1^n) * mu / (sqrt(nu_max) / sqrt(1 - b2^n) + eps)
 
+    `update` takes one argument more than optax's: with `accept=False` the gradient, whatever it holds, changes
+    nothing and the update is 0.
+
     Clipping is part of it so that the factor joins the same loops over the parameters, which on the CPU are
     memory traffic and nothing else.
     """
@@ -73,21 +76,31 @@ def amsgrad(
         mu, nu, nu_max = (jax.tree.map(jnp.zeros_like, params) for _ in range(3))
         return AmsgradState(count=jnp.zeros((), jnp.int32), mu=mu, nu=nu, nu_max=nu_max)
 
-    def update(grads: Params, state: AmsgradState, params: Params | None = None) -> tuple[Params, AmsgradState]:
+    def update(
+        grads: Params, state: AmsgradState, params: Params | None = None, *, accept: Bool[Array, ""] | bool = True
+    ) -> tuple[Params, AmsgradState]:
         del params
-        if max_grad_norm is not None:
-            scale = max_grad_norm / jnp.maximum(optax.tree.norm(grads), max_grad_norm)
-            grads = jax.tree.map(lambda g: scale * g, grads)
-        count = state.count + 1
-        rate = schedule(state.count) / _bias_correction(b1, count)
-        root = jnp.sqrt(_bias_correction(b2, count))
-        mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
-        nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
-        nu_max = jax.tree.map(jnp.maximum, state.nu_max, nu)
+        most = jnp.inf if max_grad_norm is None else max_grad_norm
+        norm = optax.tree.norm(grads)
+        scale = jnp.where(norm > most, most / norm, 1.0)
+        # Where the gradient is not accepted these numbers leave everything as it is: no second pass picks old or new.
+        grads = jax.tree.map(lambda g: jnp.where(accept, scale * g, 0.0), grads)
+        keep1, keep2, rate = jnp.where(accept, jnp.array([b1, b2, schedule(state.count)]), jnp.array([1.0, 1.0, 0.0]))
+        add1, add2 = jnp.where(accept, jnp.array([1 - b1, 1 - b2]), 0.0)
+        rate = rate / _bias_correction(b1, state.count + 1)
+        root = jnp.sqrt(_bias_correction(b2, state.count + 1))
+        # The barriers keep XLA from computing a moment twice, which would cost a copy of its old value.
+        mu = _done(jax.tree.map(lambda m, g: keep1 * m + add1 * g, state.mu, grads))
+        nu = _done(jax.tree.map(lambda v, g: keep2 * v + add2 * g * g, state.nu, grads))
+        nu_max = _done(jax.tree.map(jnp.maximum, state.nu_max, nu))
         updates = jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) / root + eps), mu, nu_max)
-        return updates, AmsgradState(count=count, mu=mu, nu=nu, nu_max=nu_max)
+        return updates, AmsgradState(count=state.count + accept, mu=mu, nu=nu, nu_max=nu_max)
 
-    return optax.GradientTransformation(init, update)
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def _done(tree: Params) -> Params:
+    return jax.lax.optimization_barrier(tree)
 
 
 def _bias_correction(decay: float, count: Int[Array, ""]) -> Float[Array, ""]:

@@ -154,7 +154,8 @@ def test_a_parameter_that_overflows_is_caught_in_the_update_that_would_make_it(s
     after, metrics = seek.programs.update(state, rollout, np.int32(0), np.bool_(True))
     assert np.isfinite(metrics["loss"]) and np.isfinite(metrics["grad_norm"])
     assert metrics["skipped"] == 1 and not np.isfinite(metrics["param_norm"])
-    jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (before.params, before.opt_state))
+    jax.tree.map(np.testing.assert_array_equal, after.params, before.params)
+    assert after.opt_state.count == before.opt_state.count and metrics["skipped_updates"] == 1
 
 
 @pytest.mark.parametrize(("scale", "clipped"), [(0.0, 0), (1e4, 1), (np.nan, 0)])

@@ -176,3 +176,15 @@ def test_state_can_be_donated():
 def test_no_updates_are_refused(total_updates):
     with pytest.raises(ConfigError, match=f"total_updates={total_updates}: accepted"):
         make_optimizer(PLAIN, total_updates)
+
+
+@pytest.mark.parametrize("max_grad_norm", [None, 0.5])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1.0])
+def test_a_gradient_that_is_not_accepted_changes_nothing(max_grad_norm, value):
+    optimizer = make_optimizer(dataclasses.replace(PLAIN, max_grad_norm=max_grad_norm), 10)
+    params = {"a": jnp.array([1.0, -2.0]), "b": jnp.array(3.0)}
+    for state in (optimizer.init(params), optimizer.update(params, optimizer.init(params))[1]):
+        bad = jax.tree.map(lambda p: jnp.full_like(p, value), params)
+        change, after = jax.jit(optimizer.update)(bad, state, accept=jnp.bool_(False))
+        jax.tree.map(np.testing.assert_array_equal, after, state)
+        assert all((c == 0).all() for c in jax.tree.leaves(change))
