@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, UInt8
 
 from foajax import frames, gaze, networks
 from foajax.config import Config
@@ -57,15 +57,18 @@ class Agent:
         statistics: FrameStatistics,
         state: ActorState,
         timestep: TimeStep,
-        key: PRNGKeyArray,
+        key: Key[Array, "*actors"],
         *,
         greedy: bool = False,
     ) -> tuple[ActorOutput, NetworkOutput, ActorState]:
         """One decision of each actor; samples both policies, or takes their modes where `greedy`.
 
-        The visual action chosen here moves the focal point that the *next* frame is sensed at.
+        The visual action chosen here moves the focal point that the *next* frame is sensed at. `key` is one, or one
+        an actor: then what an actor samples does not depend on who the others are.
         """
-        start_key, natural_key, vision_key = jax.random.split(key, 3)
+        actors = state.age.shape[0]
+        keys = jax.random.split(key, actors) if key.ndim == 0 else key
+        start_key, natural_key, vision_key = jax.vmap(lambda k: jax.random.split(k, 3), out_axes=1)(keys)
         frame = self.frame(timestep.frame)
         frame_mean, frame_std = jax.vmap(frames.frame_statistics)(frame)
         frame = self.normalise(frame, statistics)
@@ -114,13 +117,12 @@ class Agent:
         mode = self.config.network.normalization
         return jax.vmap(lambda f: frames.normalise(f, statistics, mode=mode))(frame)
 
-    def look(self, key: PRNGKeyArray, state: ActorState, timestep: TimeStep) -> tuple[Array, Array]:
+    def look(self, key: Key[Array, "B"], state: ActorState, timestep: TimeStep) -> tuple[Array, Array]:
         """Focal points to sense this step at, and the actors' ages: both begin anew with an episode."""
         age = jnp.where(timestep.is_first, 0, state.age)
         if self.config.gaze.mode == "scripted":
             return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age), age
-        keys = jax.random.split(key, age.shape[0])
-        first = jax.vmap(lambda k: gaze.start(k, **self._gaze))(keys)
+        first = jax.vmap(lambda k: gaze.start(k, **self._gaze))(key)
         return jnp.where(timestep.is_first[:, None], first, state.focal_point), age
 
     def move(self, focal_point: Int[Array, "B 2"], vision_action: Int[Array, "B"], age: Int[Array, "B"]) -> Array:
@@ -129,14 +131,15 @@ class Agent:
             return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age)
         return jax.vmap(lambda p, a: gaze.move(p, a, **self._gaze))(focal_point, vision_action)
 
-    def choose_vision(self, key: PRNGKeyArray, output: NetworkOutput, greedy: bool) -> tuple[Array, Array]:
+    def choose_vision(self, key: Key[Array, "B"], output: NetworkOutput, greedy: bool) -> tuple[Array, Array]:
         """Visual actions and their log-probabilities: learned, uniformly random, or 0 (stay)."""
         batch = output.natural_value.shape
         if output.vision_logits is not None:
             action = _choose(key, output.vision_logits, greedy)
             return action, log_prob(output.vision_logits, action)
         if self.config.gaze.mode == "random":
-            return jax.random.randint(key, batch, 0, self.config.gaze.actions), jnp.zeros(batch)
+            draw = jax.vmap(lambda k: jax.random.randint(k, (), 0, self.config.gaze.actions))
+            return draw(key), jnp.zeros(batch)
         return jnp.zeros(batch, jnp.int32), jnp.zeros(batch)
 
     def sense(self, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
@@ -153,6 +156,6 @@ class Agent:
         return {"gaze": config.gaze, "window": config.sensor.window, "frame_shape": config.env.frame_shape}
 
 
-def _choose(key: PRNGKeyArray, logits: Float[Array, "B A"], greedy: bool) -> Int[Array, "B"]:
-    action = jnp.argmax(logits, axis=-1) if greedy else jax.random.categorical(key, logits)
+def _choose(key: Key[Array, "B"], logits: Float[Array, "B A"], greedy: bool) -> Int[Array, "B"]:
+    action = jnp.argmax(logits, axis=-1) if greedy else jax.vmap(jax.random.categorical)(key, logits)
     return action.astype(jnp.int32)

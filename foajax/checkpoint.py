@@ -7,7 +7,7 @@ A checkpoint is a directory named after its ``env_steps``:
     1200/SHA256SUMS  checksums of all the files above; `sha256sum -c SHA256SUMS` checks it by hand
 
 It is written under another name, synced and renamed, so a numbered directory is always complete. Orbax
-stores the arrays, from one process today and from several once that is needed. Its CheckpointManager is
+stores the arrays; what processes share is the same in all of them, so one of them writes it. Its CheckpointManager is
 not used: it has no place for checksums inside its atomic step, leaves the half-written directory of a
 failed save behind, and on a full disk prints hundreds of lines from its own threads. Nothing here reads
 pickles or any other format that can carry code.
@@ -207,8 +207,9 @@ class Checkpoints:
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir(parents=True)
         _claim(new / "claim", sum(array.nbytes for array in arrays.values()) + _HEADROOM)
-        with ocp.PyTreeCheckpointer() as orbax:
-            orbax.save(new / "state", args=ocp.args.PyTreeSave(arrays))
+        with _orbax() as orbax:
+            # From the host: arrays of a device are refused where several processes share a run.
+            orbax.save(new / "state", args=ocp.args.PyTreeSave({name: np.asarray(x) for name, x in arrays.items()}))
         (new / "meta.json").write_text(text, encoding="utf-8")
         durable.seal(new)
         for step in sorted(self._unusable):
@@ -255,6 +256,13 @@ def _copy(leaf: Any) -> Any:
     return jax.device_put(jax.random.key_data(leaf) if _is_key(leaf) else leaf, may_alias=False)
 
 
+def _orbax() -> ocp.Checkpointer:
+    """Orbax for this process alone: it would otherwise wait for all that share a run, of which one keeps the files."""
+    alone = ocp.options.MultiprocessingOptions(primary_host=jax.process_index(), active_processes={jax.process_index()})
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
+
+
 def _claim(path: Path, size: int) -> None:
     """Takes `size` bytes of the disk and gives them back; OSError where it has no room for them.
 
@@ -289,7 +297,7 @@ def _read(path: Path, template: Any, *, part: bool) -> Restored:
 def _read_arrays(path: Path, names: list[str]) -> dict[str, np.ndarray]:
     """All arrays by name, on the host whatever devices they came from."""
     host = ocp.RestoreArgs(restore_type=np.ndarray)
-    with ocp.PyTreeCheckpointer() as orbax:
+    with _orbax() as orbax:
         return orbax.restore(path, args=ocp.args.PyTreeRestore(restore_args=dict.fromkeys(names, host)))
 
 

@@ -222,6 +222,7 @@ class TrainConfig:
     log_every: float = 10.0  # seconds
     checkpoint_every: float = 60.0  # seconds
     keep: int = 3  # newest checkpoints kept
+    devices: int = 1  # of each process, that share its environments
     max_skipped: int = 20  # updates in a row that may be skipped as not finite before the run stops
     dump_skipped: bool = False  # keep the batches that such rows begin with, in <run>/skipped
 
@@ -229,8 +230,34 @@ class TrainConfig:
         _check(self.env_steps >= 1, "train.env_steps", self.env_steps, "an integer >= 1")
         for key in ("log_every", "checkpoint_every"):
             _check(getattr(self, key) > 0, f"train.{key}", getattr(self, key), "seconds > 0")
-        for key in ("keep", "max_skipped"):
+        for key in ("keep", "devices", "max_skipped"):
             _check(1 <= getattr(self, key) <= 10**9, f"train.{key}", getattr(self, key), "an integer from 1 to 10^9")
+
+
+@dataclasses.dataclass(frozen=True)
+class DistributedConfig:
+    """The processes that share a run. SLURM's are found without any of this; other launchers state all three."""
+
+    coordinator: str | None = None  # host:port of process 0
+    processes: int | None = None
+    process: int | None = None  # this one's number, from 0
+    timeout: float = 120.0  # seconds that a process waits for the others before it saves and ends
+
+    def __post_init__(self) -> None:
+        stated = [value is not None for value in (self.coordinator, self.processes, self.process)]
+        _check(
+            all(stated) or not any(stated),
+            "distributed.coordinator, distributed.processes, distributed.process",
+            (self.coordinator, self.processes, self.process),
+            "a value for all three or for none",
+        )
+        if self.coordinator is not None and self.processes is not None and self.process is not None:
+            port = self.coordinator.rpartition(":")[2]
+            _check(port.isdecimal(), "distributed.coordinator", self.coordinator, "host:port of process 0")
+            _check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
+            accepted = f"an integer from 0 to {self.processes - 1}"
+            _check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)
+        _check(self.timeout > 0, "distributed.timeout", self.timeout, "seconds > 0")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,6 +275,7 @@ class Config:
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()
     train: TrainConfig = TrainConfig()
+    distributed: DistributedConfig = DistributedConfig()
 
     def __post_init__(self) -> None:
         _check(self.name.strip() != "", "name", repr(self.name), "the name of an experiment")
@@ -284,6 +312,7 @@ class Config:
             self.learner.minibatches,
             f"a divisor of env.num_envs={self.env.num_envs}",
         )
+        check_shares(self, self.train.devices, "train.devices", self.train.devices)
         _check(
             self.learner.minibatches % self.env.groups == 0,
             "env.groups",
@@ -302,6 +331,13 @@ class Config:
         """Where the run's files are."""
         game = "".join(c if c.isalnum() or c in "_-." else "-" for c in self.game)
         return self.run or f"runs/{game}-{self.name}-s{self.seed}"
+
+
+def check_shares(config: Config, shares: int, key: str, value: object) -> None:
+    """`ConfigError`, about `key`, unless `shares` devices can each have the same part of a minibatch."""
+    size = config.env.num_envs // config.learner.minibatches
+    accepted = f"a divisor of the {size} environments of a minibatch (env.num_envs / learner.minibatches)"
+    _check(size % shares == 0, key, value, accepted)
 
 
 def from_mapping(mapping: Mapping[str, Any]) -> Config:

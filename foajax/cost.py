@@ -108,11 +108,11 @@ def decide(
 ) -> tuple[Array, Array, CoreState]:
     """The network's part: torso to sampling, and the gaze's move."""
     batch = focal_point.shape[0]
-    natural_key, vision_key = jax.random.split(key)
+    natural_key, vision_key = jax.random.split(key, (2, batch))
     images, is_first = [image[None] for image in roi], jnp.zeros((1, batch), bool)
     output, core_state = agent.forward(params, images, agent.unit(focal_point)[None], is_first, core_state)
     output = jax.tree.map(lambda x: x[0], output)
-    natural_action = jax.random.categorical(natural_key, output.natural_logits)
+    natural_action = jax.vmap(jax.random.categorical)(natural_key, output.natural_logits)
     vision_action, _ = agent.choose_vision(vision_key, output, False)
     age = jnp.zeros(batch, jnp.int32)
     return natural_action, agent.move(focal_point, vision_action, age), core_state

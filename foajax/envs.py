@@ -75,7 +75,7 @@ def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> E
     Args:
       config: `game` and `env` are read.
       num_envs: how many environments step together.
-      seed: environment i of the Atari engines and of Gymnasium is seeded with `seed + i`.
+      seed: environment i is seeded with `seed + i`.
       render: whether `Environment.render` will be called.
 
     Raises:

@@ -82,7 +82,7 @@ def step(task: Task, state: EnvState, action: Int[Array, ""]) -> tuple[EnvState,
 class JaxEnvironment:
     """`num_envs` copies of a `Task` as an `envs.Environment`. Rewards are never clipped: they are in [-1, 1].
 
-    Each copy draws from its own key, split from `seed`. `recv` and `reset` give read-only arrays.
+    Copy i draws from the key of `seed + i`. `recv` and `reset` give read-only arrays.
     """
 
     crop_top: int | None = None
@@ -92,7 +92,7 @@ class JaxEnvironment:
         self.num_envs = num_envs
         self.num_actions = task.num_actions
         self.screen_shape: tuple[int, ...] = task.frame_shape
-        self._keys = jax.random.split(jax.random.key(seed), num_envs)
+        self._keys = jax.vmap(jax.random.key)(seed + np.arange(num_envs))
         self._reset = jax.jit(jax.vmap(partial(reset, task)))
         self._step = jax.jit(jax.vmap(partial(step, task)))
         self._observe = jax.jit(jax.vmap(partial(observe, task)))

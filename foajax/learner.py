@@ -6,11 +6,13 @@ would otherwise make `num_envs` times fewer updates a frame than the paper's thr
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from foajax import frames, losses, returns
@@ -34,10 +36,15 @@ def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs
 
 
 def minibatch(rollout: Rollout, index: Int[Array, ""], size: int) -> Rollout:
-    """`size` environments of a rollout: columns index*size .. (index+1)*size - 1."""
+    """`size` environments of a rollout: every n-th column from `index` on, n = B / size.
+
+    A slice of the rollout that holds a multiple of n environments thus has its share of every minibatch, and which
+    environments meet in one does not depend on how many devices share them.
+    """
 
     def columns(x: Array, axis: int) -> Array:
-        return jax.lax.dynamic_slice_in_dim(x, index * size, size, axis)
+        rows = x.reshape(*x.shape[:axis], size, x.shape[axis] // size, *x.shape[axis + 1 :])
+        return jax.lax.dynamic_index_in_dim(rows, index, axis + 1, keepdims=False)
 
     return Rollout(
         steps=jax.tree.map(lambda x: columns(x, 1), rollout.steps),
@@ -45,8 +52,13 @@ def minibatch(rollout: Rollout, index: Int[Array, ""], size: int) -> Rollout:
     )
 
 
-def loss(params: Params, agent: Agent, rollout: Rollout) -> tuple[Float[Array, ""], Metrics]:
-    """The paper's total loss (section "Dual-head Loss Function"): both heads' value and policy losses."""
+def loss(
+    params: Params, agent: Agent, rollout: Rollout, *, axis: str | None = None
+) -> tuple[Float[Array, ""], Metrics]:
+    """The paper's total loss (section "Dual-head Loss Function"): both heads' value and policy losses.
+
+    With `axis`, the mesh axis that the environments are spread along, the results are a device's parts of the sums.
+    """
     config = agent.config.learner
     output = agent.unroll(params, rollout)
     steps = rollout.steps
@@ -55,27 +67,33 @@ def loss(params: Params, agent: Agent, rollout: Rollout) -> tuple[Float[Array, "
     mask_t = 1.0 - steps.is_first[1:].astype(jnp.float32)  # the step after an episode's end is nobody's
     transitions = (steps.reward[1:], is_terminal_t, mask_t)
 
-    natural = _natural_targets(config.natural, *transitions, output.natural_value)
+    heads = [_natural_targets(config.natural, *transitions, output.natural_value)]
+    if output.vision_value is not None:
+        heads.append(_vision_targets(config, *transitions, output.vision_value))
+    valid = _whole(jnp.stack([losses.valid_steps(targets.mask_t) for targets in heads]), axis)
     total, metrics = _head_loss(
         config,
         config.natural,
-        natural,
+        heads[0],
+        valid[0],
         logits=output.natural_logits[:-1],
         value=output.natural_value[:-1],
         action=steps.natural_action[:-1],
         behaviour_log_prob=steps.natural_log_prob[:-1],
+        axis=axis,
     )
     metrics = {f"natural_{name}": value for name, value in metrics.items()}
     if output.vision_logits is not None and output.vision_value is not None:
-        vision = _vision_targets(config, *transitions, output.vision_value)
         vision_total, vision_metrics = _head_loss(
             config,
             config.vision,
-            vision,
+            heads[1],
+            valid[1],
             logits=output.vision_logits[:-1],
             value=output.vision_value[:-1],
             action=steps.vision_action[:-1],
             behaviour_log_prob=steps.vision_log_prob[:-1],
+            axis=axis,
         )
         total = total + config.vision_weight * vision_total
         metrics |= {f"vision_{name}": value for name, value in vision_metrics.items()}
@@ -120,21 +138,25 @@ def _head_loss(
     config: LearnerConfig,
     head: HeadConfig,
     targets: Targets,
+    valid: Int[Array, ""],
     *,
     logits: Float[Array, "T B A"],
     value: Float[Array, "T B"],
     action: Int[Array, "T B"],
     behaviour_log_prob: Float[Array, "T B"],
+    axis: str | None,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """One head's policy, value and entropy terms; the only place where they are masked, reduced and weighted."""
+    """One head's policy, value and entropy terms; the only place where they are masked, reduced and weighted.
 
-    def mean(x: Float[Array, "T B"]) -> Float[Array, ""]:
-        return losses.reduce_steps(x, targets.mask_t, reduction="mean")
-
+    `valid` counts the steps that enter, on all devices.
+    """
+    shards = jax.lax.axis_size(axis) if axis else 1
+    reduce = functools.partial(losses.reduce_steps, mask_t=targets.mask_t, steps=valid, shards=shards)
+    mean = functools.partial(reduce, reduction="mean")
     advantages = targets.advantages
     if config.normalize_advantages:
-        centred = advantages - mean(advantages)
-        advantages = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
+        centred = advantages - _whole(mean(advantages), axis)
+        advantages = centred / (jnp.sqrt(_whole(mean(centred**2), axis)) + 1e-8)
     policy = losses.policy_loss(
         logits, action, advantages, behaviour_log_prob=behaviour_log_prob, clip_ratio=config.clip_ratio
     )
@@ -142,7 +164,15 @@ def _head_loss(
     entropy = losses.entropy(logits)
     total = policy - head.beta * entropy + config.value_weight * error
     metrics = {"policy_loss": mean(policy), "value_loss": mean(error), "entropy": mean(entropy), "value": mean(value)}
-    return losses.reduce_steps(total, targets.mask_t, reduction=config.reduction), metrics
+    return reduce(total, reduction=config.reduction), metrics
+
+
+def _whole(parts: Any, axis: str | None) -> Any:
+    """The sums of the devices' parts of a tree, in one exchange: its fixed cost is paid once, not for each array."""
+    if not axis:
+        return parts
+    flat, restore = ravel_pytree(parts)
+    return restore(jax.lax.psum(flat, axis))
 
 
 def update(
@@ -153,6 +183,8 @@ def update(
     rollout: Rollout,
     index: Int[Array, ""],
     is_first_pass: Bool[Array, ""],
+    *,
+    axis: str | None = None,
 ) -> tuple[TrainState, Metrics]:
     """One optimiser step on minibatch `index` of a rollout.
 
@@ -160,9 +192,20 @@ def update(
     as skipped. So it is where a new parameter is not, but there the optimiser's averages go on: they have seen a
     finite gradient, and a step of theirs that is too large gets smaller. Frames enter the running statistics on the
     first pass over a rollout only.
+
+    With `axis`, a mesh axis, `rollout` is a device's share and `size` its share of a minibatch; the state and the
+    metrics are those of the whole, the same on every device.
     """
     part = minibatch(rollout, index, size)
-    gradient, metrics = jax.grad(loss, has_aux=True)(state.params, agent, part)
+    frame_mean, frame_std = (x[:-1].reshape(-1) for x in (part.steps.frame_mean, part.steps.frame_std))
+    results = jax.grad(loss, has_aux=True)(state.params, agent, part, axis=axis)
+    if axis:
+        shards = jax.lax.axis_size(axis)
+        averages = (jnp.mean(frame_mean) / shards, jnp.mean(frame_std) / shards)
+        results, averages = _whole((results, averages), axis)
+        # Frames count as often as there are some, each as the average of all.
+        frame_mean, frame_std = (jnp.full(frame_mean.size * shards, average) for average in averages)
+    gradient, metrics = results
     grad_norm = optax.tree.norm(gradient)
     accept = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
     change, opt_state = optimizer.update(gradient, state.opt_state, state.params, accept=accept)
@@ -172,12 +215,8 @@ def update(
     params = jax.tree.map(lambda new, old: jnp.where(finite, new, old), params, state.params)
     opt_state = opt_state._replace(count=state.opt_state.count + finite)
     most = agent.config.learner.max_grad_norm
-    steps = part.steps
     statistics = frames.update_statistics(
-        state.statistics,
-        steps.frame_mean[:-1].reshape(-1),
-        steps.frame_std[:-1].reshape(-1),
-        jnp.broadcast_to(is_first_pass, steps.frame_mean[:-1].size),
+        state.statistics, frame_mean, frame_std, jnp.broadcast_to(is_first_pass, frame_mean.size)
     )
     skipped = jnp.where(finite, 0, state.skipped + 1)
     updates = state.updates + 1

@@ -67,15 +67,28 @@ def value_loss(value: Float[Array, "*N"], target: Float[Array, "*N"]) -> Float[A
 
 
 def reduce_steps(
-    x: Float[Array, "T B"], mask_t: Float[Array, "T B"], *, reduction: Literal["mean", "sum"]
+    x: Float[Array, "T B"],
+    mask_t: Float[Array, "T B"],
+    *,
+    reduction: Literal["mean", "sum"],
+    steps: Int[Array, ""] | None = None,
+    shards: int = 1,
 ) -> Float[Array, ""]:
     """One number from a term of the loss, over the steps where `mask_t` is not 0.
 
     `mean` is the mean over all these steps (0 where there is none); `sum` adds them up over time, as the
     paper does, and takes the mean over the B environments. What `x` holds elsewhere does not matter, NaN
     included.
+
+    Where the environments are spread over `shards`, of B each, with `steps` valid steps in all (`valid_steps`), the
+    result is one shard's part: the parts add up to the number.
     """
     total = jnp.sum(jnp.where(mask_t > 0, x, 0.0))
     if reduction == "sum":
-        return total / x.shape[1]
-    return total / jnp.maximum(jnp.sum(mask_t > 0), 1)
+        return total / (x.shape[1] * shards)
+    return total / jnp.maximum(valid_steps(mask_t) if steps is None else steps, 1)
+
+
+def valid_steps(mask_t: Float[Array, "T B"]) -> Int[Array, ""]:
+    """How many steps enter the loss."""
+    return jnp.sum(mask_t > 0)

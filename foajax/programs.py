@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jax.sharding import Mesh, NamedSharding
+from jaxtyping import Array, Int, Key
 
 from foajax import frames, learner
 from foajax.agent import Agent
 from foajax.optimizer import make_optimizer
+from foajax.sharding import BATCH, DATA, EVERYWHERE, ROLLOUT, Layout
 from foajax.types import ActorState, Rollout, TimeStep, TrainState
 
 
@@ -24,15 +26,32 @@ class Programs(NamedTuple):
     update: Callable[..., tuple[TrainState, learner.Metrics]]
 
 
-def make_programs(agent: Agent) -> Programs:
-    """`act` records a decision in the rollout's buffer (donated); `update` applies one minibatch (state donated)."""
+def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
+    """`act` records a decision in the rollout's buffer (donated); `update` applies one minibatch (state donated).
+
+    With a `layout` they are the same programs on each device's share of the environments.
+    """
     config = agent.config
     optimizer = make_optimizer(config.learner, total_updates(agent))
     size = config.env.num_envs // config.learner.minibatches
+    act = functools.partial(_act, agent)
+    if layout is None:
+        update = functools.partial(learner.update, agent, optimizer, size)
+        return Programs(act=jax.jit(act, donate_argnames="rollout"), update=jax.jit(update, donate_argnames="state"))
+    update = functools.partial(learner.update, agent, optimizer, size // layout.shards, axis=DATA)
+    acting = (EVERYWHERE, BATCH, BATCH, ROLLOUT, EVERYWHERE, BATCH, EVERYWHERE)
+    updating = (EVERYWHERE, ROLLOUT, EVERYWHERE, EVERYWHERE)
     return Programs(
-        act=jax.jit(functools.partial(_act, agent), donate_argnames="rollout"),
-        update=jax.jit(functools.partial(learner.update, agent, optimizer, size), donate_argnames="state"),
+        act=_on(layout.local, act, acting, (BATCH, BATCH, ROLLOUT), donate=3),
+        update=_on(layout.job, update, updating, (EVERYWHERE, EVERYWHERE), donate=0),
     )
+
+
+def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: tuple, *, donate: int) -> Callable:
+    """`program` on each device of a mesh, compiled; arrays from the host go to the devices that need them."""
+    spread = jax.shard_map(program, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
+    shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), inputs)
+    return jax.jit(spread, in_shardings=shardings, donate_argnums=donate)
 
 
 def total_updates(agent: Agent) -> int:
@@ -49,9 +68,14 @@ def make_state(agent: Agent, seed: int) -> TrainState:
     return make(jax.random.fold_in(jax.random.key(seed), 0))
 
 
-def acting_key(seed: int, group: int) -> Array:
-    """Key of a group of actors; each step folds its own number in, so that resuming needs only the count."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 1), group)
+def acting_keys(seed: int, group: int, first: int, batch: int) -> Key[Array, "B"]:
+    """Keys of a group's actors `first` .. `first + batch - 1`.
+
+    Each step folds its own number in, so that resuming needs only the count; a key an actor, so that an actor
+    samples the same wherever the others are.
+    """
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 1), group)
+    return jax.vmap(functools.partial(jax.random.fold_in, key))(first + jnp.arange(batch))
 
 
 def empty_rollout(agent: Agent, batch: int, timestep: TimeStep) -> Rollout:
@@ -80,13 +104,13 @@ def _act(
     timestep: TimeStep,
     rollout: Rollout,
     row: Int[Array, ""],
-    key: Array,
+    keys: Key[Array, "B"],
     step: Int[Array, ""],
 ) -> tuple[Array, ActorState, Rollout]:
     """Decides, and writes the decision into row `row`. `state` is (params, statistics)."""
     params, statistics = state
-    key = jax.random.fold_in(key, step)
-    output, _, next_state = agent.act(params, statistics, actor_state, timestep, key)
+    keys = jax.vmap(jax.random.fold_in, (0, None))(keys, step)
+    output, _, next_state = agent.act(params, statistics, actor_state, timestep, keys)
     steps = jax.tree.map(
         lambda buffer, x: jax.lax.dynamic_update_index_in_dim(buffer, x, row, 0), rollout.steps, output
     )

@@ -17,7 +17,7 @@ from foajax.agent import Agent
 from foajax.config import LearnerConfig
 from foajax.envs import Environment
 from foajax.learner import Metrics
-from foajax.programs import Programs, acting_key, empty_rollout
+from foajax.programs import Programs, acting_keys, empty_rollout
 from foajax.types import ActorState, Outcome, Rollout, TimeStep, TrainState
 
 
@@ -43,17 +43,22 @@ class Group(NamedTuple):
 
 
 class Collector:
-    """Steps all groups through T steps and hands out their rollouts."""
+    """Steps all groups through T steps and hands out their rollouts.
 
-    def __init__(self, agent: Agent, programs: Programs, environments: Sequence[Environment], *, seed: int):
+    Where several processes share a run, `part` is this one's number: its environments are that part of each group.
+    """
+
+    def __init__(
+        self, agent: Agent, programs: Programs, environments: Sequence[Environment], *, seed: int, part: int = 0
+    ) -> None:
         self._programs = programs
         self._environments: list[Any] = list(environments)  # some have `get_state`
         self._length = agent.config.learner.rollout_length
-        self._keys = [acting_key(seed, group) for group in range(len(environments))]
+        batch = environments[0].num_envs
+        self._keys = [acting_keys(seed, group, part * batch, batch) for group in range(len(environments))]
         self.groups: list[Group] = []
         for environment in environments:
             timestep, _ = environment.reset()
-            batch = environment.num_envs
             self.groups.append(
                 Group(
                     timestep=timestep,

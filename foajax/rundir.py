@@ -50,6 +50,7 @@ _FREE = {
     *("run", "profile", "env.threads", "env.timeout"),
     *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep"),
     *("train.max_skipped", "train.dump_skipped"),
+    *("train.devices", *(f"distributed.{key}" for key in ("coordinator", "processes", "process", "timeout"))),
 }
 
 

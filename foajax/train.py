@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import signal
 import sys
@@ -14,20 +15,22 @@ from typing import Any
 import jax
 import numpy as np
 
-from foajax import compose, envs, profiling
+from foajax import compose, distributed, envs, profiling
 from foajax.agent import Agent
 from foajax.allocator import keep_memory
 from foajax.checkpoint import Checkpoints
 from foajax.config import Config, ConfigError
+from foajax.distributed import Job, Watch
 from foajax.dump import Dump
 from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state, use_compilation_cache
 from foajax.rollout import Collector, update_on
 from foajax.rundir import RunDir, open_run
+from foajax.sharding import Layout
 from foajax.snapshots import snapshots
 from foajax.store import CHECKPOINTS, save_facts
-from foajax.types import Outcome
+from foajax.types import Outcome, Rollout, TrainState
 from foajax.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 
 _PICTURES_EVERY = 900.0  # seconds
@@ -49,35 +52,40 @@ class StopRequest:
 
 
 class Run:
-    """One run's parts, wired together, at the point where its newest checkpoint left it."""
+    """One run's parts, wired together, at the point where its newest checkpoint left it.
 
-    def __init__(self, config: Config, run_dir: RunDir, resources: contextlib.ExitStack) -> None:
-        self._config = config
+    Processes that share a run all act and learn; the first of them has the directory, and alone writes and speaks.
+    """
+
+    def __init__(self, config: Config, job: Job, run_dir: RunDir | None, resources: contextlib.ExitStack) -> None:
+        self._config, self._job = config, job
         self._say = lambda text: print(text, file=sys.stderr, flush=True)  # until there is a logger
         self._rollout_steps = config.env.num_envs * config.learner.rollout_length
-        self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=config.train.keep, warn=self._warn)
-        self._env_steps = max(self._checkpoints.steps(), default=0)
-        self._games: list[dict[str, Any]] | None = None  # as they were after the last update
-        watchdog = Watchdog(config.env.timeout, abandon=self._abandon, is_saved=self._is_saved)
-        resources.enter_context(watchdog)
-        # Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it got.
-        make = watchdog.watched("making the environments", make_environments, patience=10.0)  # emulators load slowly
-        environments = make(config, self._env_steps)
-        for group, environment in enumerate(environments):
-            watchdog.watch(environment, f"environment group {group}")
-            resources.callback(environment.close)
+        self._checkpoints: Checkpoints | None = None
+        self._logger: Logger | None = None
+        self._dump: Dump | None = None
+        if run_dir is not None:
+            self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=config.train.keep, warn=self._warn)
+        if run_dir is not None and config.train.dump_skipped:
+            self._dump = Dump(run_dir.path / "skipped", minibatches=config.learner.minibatches, warn=self._warn)
+        self._env_steps = int(job.tell("saved", str(self._newest())))
+        self._games: list[dict[str, Any]] | None = None  # of all processes, as they were after the last update
+        environments = self._make_environments(resources)
         agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
-        save_facts(agent, run_dir.path)
-        self._programs = make_programs(agent)
-        self._collector = Collector(agent, self._programs, environments, seed=config.seed)
+        self._layout = Layout(job.devices, job.local_devices) if len(job.devices) > 1 else None
+        self._programs = make_programs(agent, self._layout)
+        self._collector = Collector(agent, self._programs, environments, seed=config.seed, part=job.index)
         self._tracker = EpisodeTracker(config.env.num_envs)
-        self._state = make_state(agent, config.seed)
-        self._dump = (
-            Dump(run_dir.path / "skipped", minibatches=config.learner.minibatches, warn=self._warn)
-            if config.train.dump_skipped
-            else None
-        )
+        self._state = self._on_all_devices(make_state(agent, config.seed))
         self._restore()
+        self._stop_agreed = False
+        self._kept: tuple[int, dict[str, Any], dict[str, Any]] | None = None
+        self._kept_at = 0.0
+        self._watch = Watch(job, config.distributed.timeout, self._rescue)
+        if run_dir is None or self._checkpoints is None:
+            self._say = lambda text: None
+            return
+        save_facts(agent, run_dir.path)
         self._logger = resources.enter_context(
             Logger(
                 run_dir.path,
@@ -90,22 +98,38 @@ class Run:
         self._say = self._logger.message
         self._say(f"{run_dir.path}: {self._how_it_starts()}")
 
+    def _make_environments(self, resources: contextlib.ExitStack) -> list[envs.Environment]:
+        """This process's, watched. Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it
+        got."""
+        watchdog = Watchdog(self._config.env.timeout, abandon=self._abandon, is_saved=self._is_saved)
+        resources.enter_context(watchdog)
+        make = watchdog.watched("making the environments", make_environments, patience=10.0)  # emulators load slowly
+        environments = make(self._config, self._env_steps, self._job)
+        for group, environment in enumerate(environments):
+            watchdog.watch(environment, f"environment group {group}")
+            resources.callback(environment.close)
+        return environments
+
     def loop(self, stop: StopRequest) -> None:
         """Rollouts and updates until `train.env_steps` or a request to stop; saves in the end, whatever ends it."""
         try:
-            self._loop(stop)
+            with self._watch.expecting_others():
+                self._loop(stop)
         finally:
+            self._watch.rest()
             self._finish()
-        self._say(self._how_it_ends(stop.name))
+        self._say(self._how_it_ends(stop.name or ("a signal to another process" if self._stop_agreed else None)))
 
     def _loop(self, stop: StopRequest) -> None:
         train = self._config.train
         logged = saved = time.monotonic()
         pictured = -math.inf
         metrics: list[Metrics] = []
-        while self._env_steps < train.env_steps and stop.name is None:
+        while self._env_steps < train.env_steps and not self._is_to_stop(stop):
+            self._keep(compiled=bool(metrics))
             step = self._env_steps // self._config.env.num_envs
-            rollouts, outcomes = self._collector.collect(self._state, step)
+            own, outcomes = self._collector.collect(self._nearby(self._state), step)
+            outcomes, games = self._meet(outcomes, stop)
             # Fetched one rollout late: by now they are there, and nothing waits for the device.
             self._check(metrics)
             now = time.monotonic()
@@ -113,21 +137,57 @@ class Run:
                 self._log(metrics)
                 logged = now
             if self._dump:
-                self._dump.remember(self._env_steps, self._state.params, rollouts)
+                self._dump.remember(self._env_steps, self._state.params, own)
+            rollouts = [self._layout.join(rollout) for rollout in own] if self._layout else own
             self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
             if now - pictured >= _PICTURES_EVERY:
-                for tag, image in snapshots(rollouts[0], self._config.env.frame_shape).items():
-                    self._logger.image(tag, image)
+                self._picture(own[0])
                 pictured = now
             self._track(outcomes)
             self._env_steps += self._rollout_steps
-            self._games = self._collector.get_state()
+            self._games = games
             if now - saved >= train.checkpoint_every:
                 self._save()
                 saved = now
         self._check(metrics)
         if metrics:
             self._log(metrics)
+
+    def _is_to_stop(self, stop: StopRequest) -> bool:
+        """Several processes stop after the same rollout, or the others would wait for the one that does not come."""
+        return stop.name is not None if self._job.count == 1 else self._stop_agreed
+
+    def _meet(
+        self, outcomes: list[list[Outcome]], stop: StopRequest
+    ) -> tuple[list[list[Outcome]], list[dict[str, Any]]]:
+        """What all processes have to know of each other after a rollout: all outcomes, and the games as they stand."""
+        games = self._collector.get_state()
+        if self._job.count == 1:
+            return outcomes, games
+        stacked = [Outcome(*(np.stack(field, axis=1) for field in zip(*group, strict=True))) for group in outcomes]
+        told = {"outcomes": stacked, "games": games, "stop": np.array([stop.name is not None])}
+        told = self._job.gather(told)
+        self._stop_agreed = bool(told["stop"].any())
+        steps = [[Outcome(*step) for step in zip(*(f.T for f in group), strict=True)] for group in told["outcomes"]]
+        return steps, told["games"]
+
+    def _keep(self, *, compiled: bool) -> None:
+        """Several processes: what is saved should one of them be lost, renewed now and then because it is a copy."""
+        if self._job.count == 1:
+            return
+        if compiled:
+            self._watch.beat()
+        now, every = time.monotonic(), self._config.distributed.timeout / 20
+        if self._job.is_first and (self._kept is None or now - self._kept_at >= every):
+            self._kept, self._kept_at = self._snapshot(), now
+
+    def _rescue(self) -> str:
+        if self._checkpoints is None or self._kept is None:
+            return "the first process saves what it can"
+        self._checkpoints.wait()
+        self._checkpoints.save(*self._kept)
+        self._checkpoints.wait()
+        return f"saved at {self._kept[0]:,} env_steps; the same command goes on from here"
 
     def _check(self, metrics: list[Metrics]) -> None:
         """Stops a run whose updates are not finite time after time."""
@@ -148,7 +208,14 @@ class Run:
         for step in zip(*outcomes, strict=True):
             self._tracker.add(Outcome(*(np.concatenate(field) for field in zip(*step, strict=True))))
 
+    def _picture(self, rollout: Rollout) -> None:
+        if self._logger is not None:
+            for tag, image in snapshots(rollout, self._config.env.frame_shape).items():
+                self._logger.image(tag, image)
+
     def _log(self, metrics: list[Metrics]) -> None:
+        if self._logger is None:
+            return
         rows = jax.device_get(metrics)
         means = {name: finite_mean([row[name] for row in rows]) for name in rows[0] if name != "skipped_in_a_row"}
         self._logger.write(
@@ -164,29 +231,58 @@ class Run:
         )
 
     def _save(self) -> None:
+        if self._checkpoints is not None:
+            self._checkpoints.save(*self._snapshot())
+
+    def _snapshot(self) -> tuple[int, dict[str, Any], dict[str, Any]]:
+        """A checkpoint's env_steps, arrays and the rest."""
         meta: dict[str, Any] = {"tracker": self._tracker.get_state()}
         if self._tracker.games >= _GAMES_FOR_A_SCORE:
             meta["score"] = self._tracker.mean_score
-        self._checkpoints.save(self._env_steps, {"train": self._state, "collector": self._games}, meta)
+        return self._env_steps, self._everything(self._games), meta
+
+    def _everything(self, games: Any) -> dict[str, Any]:
+        state = self._state
+        if self._layout and self._job.count > 1:
+            # On the host: whoever writes it need not wait for an update that another process may leave hanging.
+            state = jax.tree.map(np.array, self._layout.nearby(state))
+        return {"train": state, "collector": games}
 
     def _restore(self) -> None:
         """Takes over the newest good checkpoint, if there is one."""
-        games = self._collector.get_state()
-        restored = self._checkpoints.restore({"train": self._state, "collector": games})
-        if restored is None:
+        games = self._job.gather(self._collector.get_state())
+        template = self._everything(games)
+        restored = self._checkpoints.restore(template) if self._checkpoints is not None else None
+        found = json.loads(self._job.tell("restored", json.dumps(restored and [restored.env_steps, restored.meta])))
+        if found is None:
             self._env_steps, self._games = 0, games
             return
-        self._state, games = restored.state["train"], restored.state["collector"]
-        self._collector.set_state(games)
-        self._tracker.set_state(restored.meta["tracker"], same_games=self._collector.resumable)
-        self._env_steps, self._games = restored.env_steps, games
+        env_steps, meta = found
+        everything = self._job.share(restored.state if restored is not None else template)
+        self._state, games = self._on_all_devices(everything["train"]), everything["collector"]
+        self._collector.set_state(self._job.mine(games))
+        self._tracker.set_state(meta["tracker"], same_games=self._collector.resumable)
+        self._env_steps, self._games = env_steps, games
+
+    def _nearby(self, state: TrainState) -> TrainState:
+        """What acting needs of the state, on this process's devices."""
+        if self._layout is None:
+            return state
+        params, statistics = self._layout.nearby((state.params, state.statistics))
+        return state._replace(params=params, statistics=statistics)
+
+    def _on_all_devices(self, state: TrainState) -> TrainState:
+        return self._layout.replicate(state) if self._layout else state
+
+    def _newest(self) -> int:
+        return max(self._checkpoints.steps(), default=0) if self._checkpoints is not None else 0
 
     def _is_saved(self) -> bool:
-        return self._env_steps == max(self._checkpoints.steps(), default=0)
+        return self._checkpoints is None or self._env_steps == self._newest()
 
     def _finish(self) -> None:
         """Saves what the last update left, before the process ends, and waits for it."""
-        if self._games is None:
+        if self._games is None or self._checkpoints is None:
             return
         try:
             self._checkpoints.wait()
@@ -229,11 +325,26 @@ def environment_seed(seed: int, env_steps: int, group: int) -> int:
     return int(np.random.SeedSequence([seed, env_steps, group]).generate_state(1)[0] >> 2)
 
 
-def make_environments(config: Config, env_steps: int) -> list[envs.Environment]:
-    """The groups of environments of a run that starts at `env_steps`."""
-    batch = config.env.num_envs // config.env.groups
-    seeds = [environment_seed(config.seed, env_steps, group) for group in range(config.env.groups)]
+def make_environments(config: Config, env_steps: int, job: Job | None = None) -> list[envs.Environment]:
+    """The groups of environments of a run that starts at `env_steps`, or a process's part of each group."""
+    index, count = (job.index, job.count) if job is not None else (0, 1)
+    batch = config.env.num_envs // config.env.groups // count
+    # An engine adds an environment's number to its seed: each is seeded alike whatever the number of processes.
+    seeds = [environment_seed(config.seed, env_steps, group) + index * batch for group in range(config.env.groups)]
     return [envs.make(config, num_envs=batch, seed=seed) for seed in seeds]
+
+
+def open_run_once(config: Config, job: Job, resources: contextlib.ExitStack) -> RunDir | None:
+    """The run's directory, held by the first process; the others get None, or why it cannot be used."""
+    run_dir, problem = None, ""
+    if job.is_first:
+        try:
+            run_dir = resources.enter_context(open_run(config, command=[sys.executable, *sys.argv]))
+        except ConfigError as error:
+            problem = str(error)
+    if problem := job.tell("problem", problem):
+        raise ConfigError(problem)
+    return run_dir
 
 
 def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:
@@ -268,13 +379,16 @@ def _train(config: Config) -> None:
                 resources.callback(environment.close)
             profiling.profile(config, environments, f"{config.run_dir}/profile")
             return
+        job = distributed.start(config)
+        if config.train.dump_skipped and len(job.devices) > 1:
+            raise ConfigError("train.dump_skipped=true: accepted is false where a run has several devices")
         stop = StopRequest()
-        run_dir = resources.enter_context(open_run(config, command=[sys.executable, *sys.argv]))
+        run_dir = open_run_once(config, job, resources)
         try:
-            run = Run(config, run_dir, resources)
+            run = Run(config, job, run_dir, resources)
         except OSError as error:  # its files: whatever an environment raises is a fault of its own
             reason = f"cannot be used ({error})"
-            raise ConfigError(f"run={run_dir.path}: {reason}; accepted is a directory to write to") from None
+            raise ConfigError(f"run={config.run_dir}: {reason}; accepted is a directory to write to") from None
         run.loop(stop)
 
 

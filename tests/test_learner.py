@@ -116,8 +116,8 @@ def test_ignored_actions_do_not_matter(seek):
 def test_a_minibatch_is_its_own_environments(seek):
     (rollout,), _ = seek.collect()
     part = learner.minibatch(rollout, jnp.int32(1), 4)
-    np.testing.assert_array_equal(part.steps.reward, rollout.steps.reward[:, 4:])
-    np.testing.assert_array_equal(part.core_state.hidden, rollout.core_state.hidden[4:])
+    np.testing.assert_array_equal(part.steps.reward, rollout.steps.reward[:, 1::2])
+    np.testing.assert_array_equal(part.core_state.hidden, rollout.core_state.hidden[1::2])
 
 
 @pytest.mark.parametrize("where", ["reward", "parameter"])
@@ -130,7 +130,7 @@ def test_what_is_not_finite_is_skipped_and_counted(seek, where):
 
     state = seek.state
     if where == "reward":
-        rollout = rollout._replace(steps=rollout.steps._replace(reward=rollout.steps.reward.at[3, 1].set(jnp.nan)))
+        rollout = rollout._replace(steps=rollout.steps._replace(reward=rollout.steps.reward.at[3, 2].set(jnp.nan)))
     else:
         state = state._replace(params=jax.tree.map(lambda x: x.at[(0,) * x.ndim].set(jnp.inf), state.params))
     after, metrics = update(state, rollout)

@@ -12,6 +12,7 @@ import pytest
 from processes import TINY, finish, has_rows, rows, start, wait_for
 
 from foajax.checkpoint import Checkpoints
+from foajax.distributed import Job
 from foajax.rundir import load_config, open_run
 from foajax.store import load_agent, save_agent
 from foajax.train import Run
@@ -69,7 +70,8 @@ def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(brea
     path = shutil.copytree(breakout[0], tmp_path / "run")
     config = load_config(path)
     with contextlib.ExitStack() as resources:
-        run = Run(config, resources.enter_context(open_run(config, command=[])), resources)
+        run_dir = resources.enter_context(open_run(config, command=[]))
+        run = Run(config, Job(config), run_dir, resources)
         state, tracker, env_steps = run._state, run._tracker.get_state(), run._env_steps
     template = jax.eval_shape(lambda: state)
     saved = Checkpoints(path / "checkpoints", keep=None).restore({"train": template, "collector": []})

@@ -1,0 +1,247 @@
+"""What does a second process give, and what does adding up gradients cost?
+
+    python benchmarks/scaling.py [part=weak] [game=pong] [seconds=20] [out=weak.json]
+    python benchmarks/scaling.py [part=allreduce] [out=allreduce.json]
+    python benchmarks/scaling.py [part=model]
+
+`weak`: training, a process a core, each pinned to its own, with `envs` environments a process. One process alone;
+two that share a run; and two that do not know of each other, which shows what the machine itself takes for a second
+busy core. Speeds are env_steps a second once everything is compiled, from the third logged row on. Efficiency is the
+speed of two over twice that of one.
+
+`allreduce`: the sum of a vector over virtual devices of one process (threads, through memory), and over two
+processes (gloo on the loopback address), by the number of parameters. Medians.
+
+`model`: what bounds bigger machines, from `Assumptions`, each of which says where it comes from.
+
+Run it on an idle machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import platform
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from foajax import cli
+
+SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32
+DEVICES = (2, 4, 8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    part: Literal["all", "weak", "allreduce", "model", "member"] = "all"  # member: one process of `allreduce`
+    game: str = "pong"
+    experiment: str = "constant70_packed"
+    envs: int = 16  # of each process
+    seconds: float = 20.0  # that a speed is measured over
+    out: str | None = None
+    devices: int = 1
+    coordinator: str = ""
+    process: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Assumptions:
+    """Of the model; seconds, bytes and operations."""
+
+    emulator: float = 700e-6  # core-seconds an env_step takes EnvPool (600 to 800 measured on this kind of core)
+    decision: float = 7.3e6  # floating-point operations of a decision, constant70_packed (results/bench)
+    learning: float = 3.0  # of an update over those of a decision: forward and twice as much backward
+    parameters: float = 1.0e6  # exchanged for each minibatch, float32
+    screen: float = 210 * 160  # bytes of a frame on its way to the device
+    rollout: int = 20
+    minibatches: int = 8
+    gpu: float = 10e12  # operations a second that a GPU sustains on such small networks: assumed, not measured
+    dispatch: float = 0.3e-3  # of one program on a GPU, transfers included: assumed
+    bus: float = 20e9  # bytes a second from host to GPU: assumed
+    link: float = 100e9  # bytes a second between the GPUs of a host: assumed
+    network: float = 12.5e9  # bytes a second between hosts, 100 Gbit/s: assumed
+    delay: float = 20e-6  # of a message between hosts: assumed
+
+
+def start(arguments: Sequence[str], *, core: int | None = None, **variables: str) -> subprocess.Popen:
+    """A Python process, on one core if asked."""
+    pin = [] if core is None else ["taskset", "-c", str(core)]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"} | variables
+    return subprocess.Popen(
+        [*pin, sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def free_address() -> str:
+    """Where the first process of several can listen."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"127.0.0.1:{server.getsockname()[1]}"
+
+
+def training(options: Options, run: Path, processes: int, process: int, address: str) -> list[str]:
+    """The words of one process of a run: equal work for each process, whatever their number."""
+    words = [f"game={options.game}", f"experiment={options.experiment}", f"run={run}", "env.threads=1"]
+    words += [f"env.num_envs={options.envs * processes}", "learner.minibatches=4", "train.log_every=0.5"]
+    words += ["train.env_steps=100000000", "train.checkpoint_every=1000"]
+    if processes > 1:
+        shared = {"coordinator": address, "processes": processes, "process": process}
+        words += [f"distributed.{key}={value}" for key, value in shared.items()]
+    return ["-m", "foajax.train", *words]
+
+
+def rows(run: Path) -> list[dict[str, Any]]:
+    """What a run has logged so far."""
+    file = run / "metrics.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def speed(run: Path, processes: Sequence[subprocess.Popen], seconds: float) -> float:
+    """env_steps a second, from the third row on for so many seconds; then the processes are ended."""
+    try:
+        while len(logged := rows(run)) < 4 or logged[-1]["time"] - logged[2]["time"] < seconds:
+            for process in processes:
+                if process.poll() is not None:
+                    raise RuntimeError(process.stdout.read() if process.stdout else process.args)
+            time.sleep(0.2)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    first, last = logged[2], logged[-1]
+    return (last["env_steps"] - first["env_steps"]) / (last["time"] - first["time"])
+
+
+def weak(options: Options) -> dict[str, Any]:
+    """Speeds of one process, of two that share a run, and of two runs at a time."""
+    with tempfile.TemporaryDirectory() as temporary:
+        directory = Path(temporary)
+
+        def measure(name: str, processes: int, beside: int = 0) -> float:
+            address = free_address()
+            words = [training(options, directory / name, processes, i, address) for i in range(processes)]
+            words += [training(options, directory / f"{name}-beside", 1, 0, "")] * beside
+            started = [start(w, core=core) for core, w in enumerate(words)]
+            return speed(directory / name, started, options.seconds)
+
+        one = measure("one", 1)
+        two = measure("two", 2)
+        beside = measure("beside", 1, beside=1)
+    return {
+        "one process": one,
+        "two processes": two,
+        "efficiency": two / (2 * one),
+        "one of two separate runs": beside,
+        "efficiency against separate runs": two / (2 * beside),
+    }
+
+
+def allreduce() -> dict[str, Any]:
+    """Microseconds of a sum, by devices and parameters."""
+    found: dict[str, Any] = {}
+    for devices in DEVICES:
+        process = start([__file__, "part=member", f"devices={devices}"], JAX_NUM_CPU_DEVICES=str(devices))
+        found[f"{devices} virtual devices"] = json.loads(process.communicate()[0].splitlines()[-1])
+    address = free_address()
+    members = [start([__file__, "part=member", f"coordinator={address}", f"process={i}"], core=i) for i in (0, 1)]
+    found["2 processes"] = [json.loads(m.communicate()[0].splitlines()[-1]) for m in members][0]
+    return found
+
+
+def member(options: Options) -> dict[str, float]:
+    """One process of `allreduce`: median microseconds by number of parameters."""
+    import jax
+    import numpy as np
+    from jax.sharding import Mesh, PartitionSpec
+
+    if options.coordinator:
+        jax.distributed.initialize(
+            options.coordinator, num_processes=2, process_id=options.process, cluster_detection_method="deactivate"
+        )
+    mesh = Mesh(np.array(jax.devices()), ("data",))
+    everywhere = PartitionSpec()
+    add = jax.jit(
+        jax.shard_map(
+            lambda x: jax.lax.psum(x, "data") / mesh.size,
+            mesh=mesh, in_specs=everywhere, out_specs=everywhere, check_vma=False,
+        )
+    )  # fmt: skip
+    medians = {}
+    for size in SIZES:
+        place = jax.sharding.NamedSharding(mesh, everywhere)
+        x = jax.make_array_from_process_local_data(place, np.ones(size, np.float32), (size,))
+        times = []
+        for _ in range(max(10, 60_000_000 // size // mesh.size)):
+            begin = time.perf_counter()
+            x = jax.block_until_ready(add(x))
+            times.append((time.perf_counter() - begin) * 1e6)
+        medians[str(size)] = statistics.median(times[2:])
+    return medians
+
+
+def rollout_seconds(a: Assumptions, *, hosts: int, gpus: int, cores: int, envs: int) -> dict[str, float]:
+    """Where a rollout's time goes, by part; `gpus`, `cores` and `envs` of each host."""
+    steps = a.rollout * envs  # of a host
+    devices, size = hosts * gpus, 4 * a.parameters
+    # A ring sends each parameter twice; between hosts the sum also waits for messages, there and back up a tree.
+    inside = 2 * size * (gpus - 1) / gpus / a.link
+    between = 2 * size * (hosts - 1) / hosts / a.network + 2 * math.ceil(math.log2(hosts)) * a.delay
+    return {
+        "emulators": steps * a.emulator / cores,
+        "acting": a.rollout * a.dispatch + steps / gpus * (a.decision / a.gpu + a.screen / a.bus),
+        "learning": a.minibatches * a.dispatch + steps / gpus * a.learning * a.decision / a.gpu,
+        "exchange": a.minibatches * (inside + between) if devices > 1 else 0.0,
+    }
+
+
+def model() -> dict[str, Any]:
+    """env_steps a second, and the share of each part, for the machines that docs/scaling.md discusses."""
+    machines = {
+        "1 host, 8 GPUs, 256 cores, 2048 environments": {"hosts": 1, "gpus": 8, "cores": 256, "envs": 2048},
+        "1 host, 8 GPUs, 256 cores, 8192 environments": {"hosts": 1, "gpus": 8, "cores": 256, "envs": 8192},
+        "100 such hosts, 2048 environments each": {"hosts": 100, "gpus": 8, "cores": 256, "envs": 2048},
+        "100 such hosts, 256 environments each": {"hosts": 100, "gpus": 8, "cores": 256, "envs": 256},
+    }
+    found = {}
+    for name, machine in machines.items():
+        seconds = rollout_seconds(Assumptions(), **machine)
+        total, steps = sum(seconds.values()), Assumptions.rollout * machine["envs"] * machine["hosts"]
+        shares = {f"{part}, %": round(100 * second / total, 1) for part, second in seconds.items()}
+        found[name] = {"env_steps a second": round(steps / total), **shares}
+    return found
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
+    options = cli.parse(Options, arguments)
+    if options.part == "member":
+        print(json.dumps(member(options)))
+        return
+    import jaxlib
+
+    versions = {"python": platform.python_version(), "jax": jaxlib.__version__, "cores": len(os.sched_getaffinity(0))}
+    result: dict[str, Any] = {"options": dataclasses.asdict(options), **versions}
+    if options.part in ("all", "weak"):
+        result["env_steps a second"] = weak(options)
+    if options.part in ("all", "allreduce"):
+        result["microseconds by parameters"] = allreduce()
+    if options.part in ("all", "model"):
+        result["model"] = model()
+    text = json.dumps(result, indent=1)
+    print(text)
+    if options.out:
+        Path(options.out).write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))

@@ -1,0 +1,207 @@
+"""Several devices, several processes: the same run, and its end when one of them is lost. Real processes, gloo."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from foajax.compose import compose
+from foajax.config import ConfigError
+from foajax.store import load_agent
+
+# 32 environments, 4 updates of 8 of them a rollout of 128 env_steps. So small an image has no torso: only the first
+# of several processes finds compiled programs again, and what a torso does with its share is tested elsewhere.
+WORDS = [
+    "game=seek",
+    "experiment=constant50_sub2_packed",
+    "sensor=rings",
+    "sensor.rings=[[14,14,2]]",
+    "sensor.layout=packed",
+    "network.dense=16",
+    "network.lstm=16",
+    "env.num_envs=32",
+    "learner.minibatches=4",
+    "learner.rollout_length=4",
+    "train.log_every=1e-6",
+]
+TWENTY_UPDATES = 640  # env_steps
+
+
+def start(*words, **variables):
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
+    command = [sys.executable, "-m", "foajax.train", *WORDS, *words]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, env=environment | variables, text=True, **pipes)
+
+
+def start_job(count, *words):
+    """`count` processes on this machine that find each other at a free port."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    where = [f"distributed.coordinator=127.0.0.1:{port}", f"distributed.processes={count}"]
+    return [start(*words, *where, f"distributed.process={i}") for i in range(count)]
+
+
+def finish(*processes):
+    """Their output; all have to end well."""
+    outputs = [process.communicate(timeout=900) for process in processes]
+    for process, (_, err) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, err
+    return [out for out, _ in outputs]
+
+
+def rows(run):
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_same(run, other):
+    a, b = load_agent(run), load_agent(other)
+    assert a.env_steps == b.env_steps
+    learned = [(stored.params, stored.statistics) for stored in (a, b)]
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=2e-4, atol=2e-6), *learned)
+    # Scores and games are counted over all processes, in the same order.
+    for row, expected in zip(rows(run), rows(other), strict=True):
+        for name in ("env_steps", "games", "score", "length"):
+            assert row[name] == expected[name]
+        np.testing.assert_allclose(row["loss"], expected["loss"], rtol=1e-3, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    """The run that the others are compared with: one process, one device."""
+    run = tmp_path_factory.mktemp("one") / "run"
+    finish(start(f"run={run}", f"train.env_steps={TWENTY_UPDATES}"))
+    return run
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """Two processes with 16 environments each."""
+    run = tmp_path_factory.mktemp("two") / "run"
+    first, second = finish(*start_job(2, f"run={run}", f"train.env_steps={TWENTY_UPDATES}"))
+    assert "done: 640 env_steps" in first
+    assert "env_steps" not in second  # only the first speaks
+    return run
+
+
+def test_four_devices_learn_what_one_learns(one, tmp_path):
+    words = [f"run={tmp_path}", f"train.env_steps={TWENTY_UPDATES}", "train.devices=4"]
+    finish(start(*words, JAX_NUM_CPU_DEVICES="4"))
+    assert_same(tmp_path, one)
+
+
+def test_two_processes_learn_what_one_learns(one, two):
+    assert_same(two, one)
+
+
+def test_what_two_processes_saved_one_goes_on_with_and_the_reverse(one, two):
+    """Episodes of seek are 96 steps long: they go on, and end, with other processes than they began with."""
+    (out,) = finish(start(f"run={two}", "train.env_steps=3840"))
+    assert "resumed at 640 env_steps (episodes go on)" in out
+    first, _ = finish(*start_job(2, f"run={one}", "train.env_steps=3840"))
+    assert "resumed at 640 env_steps (episodes go on)" in first
+    assert rows(one)[-1]["games"] == 32
+    assert_same(one, two)
+
+
+def lose_one(tmp_path, number, *, which=1):
+    """Two endless processes, one of which gets a signal; the other's exit code and last words."""
+    words = ["train.env_steps=100000000", "train.checkpoint_every=1000", "distributed.timeout=4"]
+    processes = start_job(2, f"run={tmp_path}", *words)
+    lost, left = processes[which], processes[1 - which]
+    try:
+        end = time.monotonic() + 900
+        while not (tmp_path / "metrics.jsonl").exists() or len((tmp_path / "metrics.jsonl").read_text()) < 2000:
+            assert time.monotonic() < end and left.poll() is None, left.communicate()
+            assert lost.poll() is None, lost.communicate()
+            time.sleep(0.1)
+        lost.send_signal(number)
+        begin = time.monotonic()
+        _, err = left.communicate(timeout=60)
+        assert time.monotonic() - begin < 30
+    finally:
+        for process in processes:
+            process.kill()
+        lost.communicate()
+    return left.returncode, [line for line in err.splitlines() if line.startswith("foajax: error: ")]
+
+
+HANGS = pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, HANGS])
+def test_a_process_that_is_lost_ends_the_others_with_a_checkpoint(tmp_path, number):
+    code, lines = lose_one(tmp_path, number)
+    assert code == 75
+    (line,) = lines
+    saved = max(int(path.name) for path in (tmp_path / "checkpoints").iterdir())
+    assert "process 0 of 2: another process died or hangs" in line
+    assert f"saved at {saved:,} env_steps; the same command goes on from here" in line
+    assert saved > 0
+    assert load_agent(tmp_path).env_steps == saved
+
+
+@pytest.mark.slow
+def test_when_the_first_process_is_lost_the_others_end(tmp_path):
+    code, _ = lose_one(tmp_path, signal.SIGKILL, which=0)
+    assert code != 0
+
+
+@pytest.mark.slow
+def test_a_signal_to_any_process_stops_all_and_saves(tmp_path):
+    first, second = start_job(2, f"run={tmp_path}", "train.env_steps=100000000")
+    end = time.monotonic() + 900
+    while not (tmp_path / "metrics.jsonl").exists():
+        assert time.monotonic() < end and first.poll() is None, first.communicate()
+        time.sleep(0.1)
+    second.send_signal(signal.SIGTERM)
+    out, _ = finish(first, second)
+    saved = max(int(path.name) for path in (tmp_path / "checkpoints").iterdir())
+    assert f"saved at {saved:,} env_steps" in out and rows(tmp_path)[-1]["env_steps"] == saved
+
+
+@pytest.mark.slow
+def test_a_directory_that_cannot_be_used_ends_all_in_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    processes = start_job(2, f"run={tmp_path / 'file'}")
+    for process in processes:
+        _, err = process.communicate(timeout=100)
+        assert process.returncode == 2, err
+        assert "is a file; accepted is a directory" in err
+
+
+def test_devices_have_to_share_a_minibatch_evenly():
+    with pytest.raises(ConfigError, match=r"train.devices=3: accepted is a divisor of the 4 environments of a minib"):
+        compose(["train.devices=3"])
+
+
+@pytest.mark.slow
+def test_more_devices_than_there_are_is_one_line(tmp_path):
+    process = start(f"run={tmp_path}", "train.devices=4", JAX_NUM_CPU_DEVICES="2")
+    _, err = process.communicate(timeout=100)
+    assert process.returncode == 2 and len(err.splitlines()) == 1
+    assert "train.devices=4: accepted is up to 2 here, cpu" in err
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["distributed.coordinator=127.0.0.1:1"], "accepted is a value for all three or for none"),
+        (["distributed.coordinator=a", "distributed.processes=2", "distributed.process=0"], "host:port"),
+        (["distributed.coordinator=a:1", "distributed.processes=2", "distributed.process=2"], "from 0 to 1"),
+        (["distributed.coordinator=a:1", "distributed.processes=0", "distributed.process=0"], "an integer >= 1"),
+        (["distributed.timeout=0"], "seconds > 0"),
+    ],
+)
+def test_what_cannot_be_a_job_is_refused(words, said):
+    with pytest.raises(ConfigError, match=said):
+        compose(words)
