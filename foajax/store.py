@@ -80,7 +80,7 @@ def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None 
     directory.mkdir(parents=True, exist_ok=True)
     arrays = named((stored.params, stored.statistics))
     save_file(arrays, directory / _PARAMETERS)
-    config = to_mapping(stored.agent.config)
+    config = to_mapping(dataclasses.replace(stored.agent.config, run=None))  # where it was trained does not matter
     (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     known = {} if score is None else {"score": dict(score)}
     save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
