@@ -133,4 +133,4 @@ def test_calls_take_turns_and_the_median_counts(monkeypatch):
     monkeypatch.setattr(cost.time, "perf_counter", lambda: next(clock))
     groups = [{"a": functools.partial(order.append, "a")}, {"b": functools.partial(order.append, "b")}]
     assert cost._time(groups, 3) == [{"a": 2e6}, {"b": 9e6}]
-    assert "".join(order) == "ab" * 4  # once each to compile, then three repeats
+    assert "".join(order) == "ab" + "aabb" * 3  # once each to compile, then three repeats, each after one untimed

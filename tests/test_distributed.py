@@ -103,6 +103,7 @@ def test_two_processes_learn_what_one_learns(one, two):
     assert_same(two, one)
 
 
+@pytest.mark.slow
 def test_what_two_processes_saved_one_goes_on_with_and_the_reverse(one, two):
     """Episodes of seek are 96 steps long: they go on, and end, with other processes than they began with."""
     (out,) = finish(start(f"run={two}", "train.env_steps=3840"))
