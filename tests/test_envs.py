@@ -354,7 +354,7 @@ def test_the_pure_functions_scanned_are_the_host_environment():
     task = probes.memory((8, 8))
     actions = random_actions(20, 1, 2).astype(np.int32)
     host = play(jax_envs.JaxEnvironment(task, num_envs=1, seed=4), actions)
-    state, first = jax_envs.reset(task, jax.random.split(jax.random.key(4), 1)[0])
+    state, first = jax_envs.reset(task, jax.random.key(4))  # environment i has the key of seed + i
     np.testing.assert_array_equal(first.frame, host.frame[0, 0])
     _, steps = jax.lax.scan(lambda s, a: jax_envs.step(task, s, a), state, actions[:, 0])
     for name in ("frame", "reward", "is_first", "is_terminal"):
