@@ -241,7 +241,7 @@ class DistributedConfig:
     coordinator: str | None = None  # host:port of process 0
     processes: int | None = None
     process: int | None = None  # this one's number, from 0
-    timeout: float = 120.0  # seconds that a process waits for the others before it saves and ends
+    timeout: float = 180.0  # seconds to wait for the others before saving and ending; more than env.timeout
 
     def __post_init__(self) -> None:
         stated = [value is not None for value in (self.coordinator, self.processes, self.process)]

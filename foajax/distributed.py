@@ -162,6 +162,14 @@ def _by_data(function: Callable[[Any], Any], tree: Any) -> Any:
     return jax.tree.unflatten(structure, wrapped)
 
 
+def leave(code: int) -> int:
+    """The exit code of a process that fails alone; one of several ends here, as an orderly end would wait for them."""
+    if jax.process_count() > 1:
+        sys.stdout.flush()
+        os._exit(code)
+    return code
+
+
 class Watch:
     """Ends a process that waits for others in vain.
 
@@ -191,8 +199,9 @@ class Watch:
         """Turns a collective's failure, as when another process dies, into the end of this one."""
         try:
             yield
-        except jax.errors.JaxRuntimeError as error:
-            if self._job.count == 1:
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            # Gloo's failures come as either, depending on the call that they come up in.
+            if self._job.count == 1 or (isinstance(error, ValueError) and "Gloo" not in str(error)):
                 raise
             self._end(" ".join(str(error).split())[:160])
 

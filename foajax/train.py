@@ -77,11 +77,12 @@ class Run:
         self._collector = Collector(agent, self._programs, environments, seed=config.seed, part=job.index)
         self._tracker = EpisodeTracker(config.env.num_envs)
         self._state = self._on_all_devices(make_state(agent, config.seed))
-        self._restore()
         self._stop_agreed = False
         self._kept: tuple[int, dict[str, Any], dict[str, Any]] | None = None
         self._kept_at = 0.0
         self._watch = Watch(job, config.distributed.timeout, self._rescue)
+        with self._watch.expecting_others():
+            self._restore()
         if run_dir is None or self._checkpoints is None:
             self._say = lambda text: None
             return
@@ -101,7 +102,8 @@ class Run:
     def _make_environments(self, resources: contextlib.ExitStack) -> list[envs.Environment]:
         """This process's, watched. Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it
         got."""
-        watchdog = Watchdog(self._config.env.timeout, abandon=self._abandon, is_saved=self._is_saved)
+        alone = self._job.count == 1
+        watchdog = Watchdog(self._config.env.timeout, abandon=self._abandon, is_saved=self._is_saved, alone=alone)
         resources.enter_context(watchdog)
         make = watchdog.watched("making the environments", make_environments, patience=10.0)  # emulators load slowly
         environments = make(self._config, self._env_steps, self._job)
@@ -182,8 +184,10 @@ class Run:
             self._kept, self._kept_at = self._snapshot(), now
 
     def _rescue(self) -> str:
-        if self._checkpoints is None or self._kept is None:
+        if self._checkpoints is None:
             return "the first process saves what it can"
+        if self._kept is None:
+            return "nothing has been learned since the start"
         self._checkpoints.wait()
         self._checkpoints.save(*self._kept)
         self._checkpoints.wait()
@@ -352,6 +356,8 @@ def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> i
     run_dir = Path(config.run_dir)
     steps = Checkpoints(run_dir / CHECKPOINTS, keep=None).steps()
     saved = f"saved at {steps[-1]:,} env_steps, the same command goes on from there" if steps else "nothing to save yet"
+    if jax.process_index():
+        saved = "the first process saves what it can"
     line = f"game={config.game}: {what}; {saved}; details in {record(run_dir, error)}"
     print(f"foajax: error: {line}", file=sys.stderr, flush=True)
     return FAULT
@@ -367,7 +373,7 @@ def train(config: Config) -> int:
     try:
         _train(config)
     except EnvironmentFault as fault:
-        return report_fault(config, str(fault), fault)
+        return distributed.leave(report_fault(config, str(fault), fault))
     return 0
 
 

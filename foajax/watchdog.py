@@ -56,10 +56,19 @@ class Watchdog:
         or a line about the call) and the exit code; the main thread does nothing more then, and what it had
         before the call is whole.
       is_saved: whether there is nothing to lose.
+      alone: whether it ends a process that does not answer a request to stop. One of several that stop together
+        has to wait for them: its end would break what they are in.
     """
 
-    def __init__(self, timeout: float, *, abandon: Callable[[str, int], None], is_saved: Callable[[], bool]) -> None:
-        self._timeout, self._abandon, self._is_saved = timeout, abandon, is_saved
+    def __init__(
+        self,
+        timeout: float,
+        *,
+        abandon: Callable[[str, int], None],
+        is_saved: Callable[[], bool],
+        alone: bool = True,
+    ) -> None:
+        self._timeout, self._abandon, self._is_saved, self._alone = timeout, abandon, is_saved, alone
         self._lock = threading.Lock()  # held for good by a watchdog that has taken over
         self._call: Call | None = None
         self._calls = 0
@@ -128,7 +137,7 @@ class Watchdog:
             since_asked += passed if asked else 0.0
             if call is not None and waited > call.timeout:
                 self._take_over(call, f"{call.what} has not returned for {call.timeout:g} s (env.timeout)", FAULT)
-            elif since_asked > GRACE:
+            elif self._alone and since_asked > GRACE:
                 self._overdue = True
                 self._take_over(call, asked, 0)
 

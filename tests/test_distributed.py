@@ -9,11 +9,13 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from foajax import distributed
 from foajax.compose import compose
 from foajax.config import ConfigError
 from foajax.store import load_agent
@@ -43,12 +45,13 @@ def start(*words, **variables):
     return subprocess.Popen(command, env=environment | variables, text=True, **pipes)
 
 
-def start_job(count, *words):
-    """`count` processes on this machine that find each other at a free port."""
+def start_job(count, *words, last=None):
+    """`count` processes on this machine that find each other at a free port; the last one has variables of its own."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     where = [f"distributed.coordinator=127.0.0.1:{port}", f"distributed.processes={count}"]
-    return [start(*words, *where, f"distributed.process={i}") for i in range(count)]
+    variables = [{}] * (count - 1) + [last or {}]
+    return [start(*words, *where, f"distributed.process={i}", **variables[i]) for i in range(count)]
 
 
 def finish(*processes):
@@ -149,6 +152,58 @@ def test_a_process_that_is_lost_ends_the_others_with_a_checkpoint(tmp_path, numb
     assert f"saved at {saved:,} env_steps; the same command goes on from here" in line
     assert saved > 0
     assert load_agent(tmp_path).env_steps == saved
+    (out,) = finish(start(f"run={tmp_path}", f"train.env_steps={saved + 128}"))  # one goes on where two were
+    assert f"resumed at {saved:,} env_steps (episodes go on)" in out and f"done: {saved + 128:,} env_steps" in out
+
+
+class Ended(BaseException):
+    """In place of a process's end."""
+
+
+@pytest.mark.parametrize(
+    ("error", "count", "ends"),
+    [
+        (jax.errors.JaxRuntimeError("INTERNAL: Gloo all-reduce failed: closed"), 2, True),
+        (ValueError("UNKNOWN: Gloo AllGather failed: Connection closed by peer"), 2, True),
+        (ValueError("a mistake of this process's own"), 2, False),
+        (jax.errors.JaxRuntimeError("INTERNAL: a fault of the device"), 1, False),
+    ],
+)
+def test_a_collective_that_fails_ends_a_process_whatever_it_raises(monkeypatch, capsys, error, count, ends):
+    def end(code):
+        raise Ended(code)
+
+    monkeypatch.setattr(distributed.os, "_exit", end)
+    job = object.__new__(distributed.Job)
+    job.index, job.count = 0, count
+    watch = distributed.Watch(job, 1000.0, lambda: "saved")
+    with pytest.raises(Ended if ends else type(error)) as caught, watch.expecting_others():
+        raise error
+    assert caught.value.args == (75,) if ends else caught.value is error
+    said = f"foajax: error: process 0 of 2: another process died or hangs ({error}); saved\n"
+    assert capsys.readouterr().err == (said if ends else "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["raise:make", "raise:step", "hang:step"])
+def test_a_process_whose_environment_fails_says_so_and_the_others_save(tmp_path, monkeypatch, fault):
+    """Soon: an orderly end would wait for the others, as they for it."""
+    tests = Path(__file__).parent
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tests.parent), str(tests)]))
+    words = ["game=gymnasium:faulty:Faulty-v0", "env.timeout=5", "train.env_steps=1000", f"run={tmp_path / 'run'}"]
+    processes = start_job(2, *words, last={"FAULTY": fault})
+    try:
+        errors = [process.communicate(timeout=90)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [process.returncode for process in processes] == [75, 3], errors
+    (line,) = errors[0].splitlines()
+    saved = load_agent(tmp_path / "run").env_steps
+    assert "foajax: error: process 0 of 2: another process died or hangs (" in line
+    assert f"; saved at {saved:,} env_steps; the same command goes on from here" in line
+    assert 0 <= saved <= 384  # the thirteenth step is in the fourth rollout of four
+    assert "; the first process saves what it can; details in " in errors[1]
 
 
 @pytest.mark.slow

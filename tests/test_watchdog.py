@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -31,7 +32,7 @@ def tell(why, code):
     print(f"abandoned: {why} ({code})")
 
 signal.signal(signal.SIGTERM, lambda *_: print("heard", flush=True))
-with module.Watchdog(TIMEOUT, abandon=tell, is_saved=lambda: SAVED) as watchdog:
+with module.Watchdog(TIMEOUT, abandon=tell, is_saved=lambda: SAVED, alone=ALONE) as watchdog:
     sleep = watchdog.watched("the emulator: recv", time.sleep)
     print("ready", flush=True)
     BODY
@@ -39,9 +40,10 @@ print("alive")
 """
 
 
-def script(body, *, timeout=1.0, saved=False):
+def script(body, *, timeout=1.0, saved=False, alone=True):
     """A process that runs `body` under a watchdog; returns once it is there."""
-    code = _SCRIPT.replace("TIMEOUT", str(timeout)).replace("SAVED", str(saved)).replace("BODY", body)
+    values = {"TIMEOUT": timeout, "SAVED": saved, "ALONE": alone, "BODY": body}
+    code = functools.reduce(lambda text, name: text.replace(name, str(values[name])), values, _SCRIPT)
     process = subprocess.Popen([sys.executable, "-c", code], cwd=TESTS.parent, text=True, stdout=subprocess.PIPE)
     assert process.stdout.readline() == "ready\n"
     return process
@@ -92,6 +94,14 @@ def test_a_request_to_stop_is_answered_by_whoever_can(body, saved, ended):
         assert out == "heard\nabandoned: SIGTERM (0)\n" and time.monotonic() - begin < 3
     else:
         assert out == "heard\nalive\n"
+
+
+def test_one_of_several_processes_leaves_a_request_to_stop_to_all_of_them():
+    """Also where there is nothing to lose here, and where the next call of an environment comes late."""
+    process = script("time.sleep(3); sleep(0.1)", saved=True, alone=False)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=20)
+    assert process.returncode == 0 and out == "heard\nalive\n"
 
 
 def test_an_error_is_named_and_passed_on():
