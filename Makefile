@@ -35,7 +35,7 @@ train: $(STAMP)
 	$(BIN)/python -m foajax.train $(ARGS)
 
 test: $(STAMP)
-	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m 'not slow' $(TEST_ARGS)
+	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m 'not slow' $(TEST_ARGS)
 
 test-slow: $(STAMP)
 	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m slow $(TEST_ARGS)
