@@ -7,6 +7,7 @@ nevertheless. A signal goes on to the running processes, which save; no further 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -58,25 +59,42 @@ class _Stop:
 def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.executable, "-m", "foajax.train")) -> int:
     """Runs `command` with each run's words, `jobs` at a time; 0 unless one failed.
 
-    One at a time, a run has the terminal; beside others it writes to ``output.txt`` in its directory.
+    One at a time, a run has the terminal and the machine; beside others it writes to ``output.txt`` in its directory
+    and has its share of the processor's cores.
     """
     waiting = deque(run for run in runs if not skip_if_finished(run.config))
     failures: dict[str, str] = {}
+    shares = deque(shares_of_cores(jobs))
+    taken: dict[str, set[int]] = {}  # by run directory
     stop = _Stop()
     with stop.listening():
         while stop.processes or (waiting and not stop.requested):
             while waiting and len(stop.processes) < jobs and not stop.requested:
                 run = waiting.popleft()
                 _say(f"{run.config.run_dir}: starting")
-                stop.processes[run.config.run_dir] = _start(run, command, alone=jobs == 1)
+                taken[run.config.run_dir] = cores = shares.popleft()
+                with _on(cores):
+                    stop.processes[run.config.run_dir] = _start(run, command, alone=jobs == 1)
             time.sleep(_POLL)
             for directory, process in list(stop.processes.items()):
                 if (code := process.poll()) is not None:
                     del stop.processes[directory]
+                    shares.append(taken.pop(directory))
                     # Whoever is told to stop before it can save is not at fault.
                     if code and not (stop.requested and -code in _PASSED_ON):
                         failures[directory] = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit {code}"
     return summarise([run.config for run in runs], failures)
+
+
+def shares_of_cores(jobs: int) -> list[set[int]]:
+    """Which of this process's cores each of `jobs` runs has, as equal as can be; empty sets where a system cannot say.
+
+    A run on its own cores does not wait at every small product for threads that another run keeps from starting.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return [set() for _ in range(jobs)]
+    cores = sorted(os.sched_getaffinity(0))
+    return [set(cores[job % len(cores) :: jobs]) for job in range(jobs)]
 
 
 def skip_if_finished(config: Config) -> bool:
@@ -105,6 +123,20 @@ def summarise(configs: Sequence[Config], failures: Mapping[str, str]) -> int:
     for line in lines:
         _say(f"  {line}")
     return 1 if failed else 0
+
+
+@contextlib.contextmanager
+def _on(cores: set[int]) -> Iterator[None]:
+    """What starts meanwhile runs on these cores."""
+    if not cores:
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen:

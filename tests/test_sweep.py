@@ -24,6 +24,7 @@ directory, what = pathlib.Path(sys.argv[-2]), sys.argv[-1]
 directory.mkdir(exist_ok=True)
 times = directory / "times"
 times.write_text(str(time.time()))
+(directory / "cores").write_text(",".join(map(str, sorted(os.sched_getaffinity(0)))))
 if what == "wait":
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     (directory / "ready").touch()
@@ -65,6 +66,26 @@ def test_one_after_another_or_some_at_a_time(make):
         moments = sorted((moment, step) for run in runs for moment, step in zip(times(run), (1, -1), strict=True))
         running = [sum(step for _, step in moments[: i + 1]) for i in range(len(moments))]
         assert max(running) == jobs
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot say where a process runs")
+def test_runs_beside_one_another_share_the_cores(make):
+    def cores_of(run):
+        return {int(core) for core in (Path(run.config.run_dir) / "cores").read_text().split(",")}
+
+    mine = os.sched_getaffinity(0)
+    for jobs in (1, 2):
+        runs = [make(f"{jobs}-{i}", "finish") for i in range(2)]
+        assert sweep.run_all(runs, jobs=jobs, command=COMMAND) == 0
+        first, second = map(cores_of, runs)
+        assert first | second == mine == os.sched_getaffinity(0)
+        if len(mine) > 1:
+            assert (first & second == set()) == (jobs == 2)
+
+
+def test_more_runs_than_cores_share_them_too():
+    shares = sweep.shares_of_cores(1000)
+    assert len(shares) == 1000 and all(shares)
 
 
 def test_what_is_finished_is_not_started(make, capfd):
