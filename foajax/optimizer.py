@@ -31,17 +31,21 @@ class AmsgradState(NamedTuple):
 def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.GradientTransformationExtraArgs:
     """The optimiser of a run: clipping by global norm, AMSGrad, learning rate.
 
-    The rate of update n = 1, 2, .. is `learning_rate`, times max(0, 1 - (n - 1) / total_updates) where
-    `schedule` is `linear`. Raises `ConfigError` where `total_updates` is below 1.
+    The rate of update n = 1, 2, .. is `learning_rate`, times min(1, n / warmup_updates), times
+    max(0, 1 - (n - 1) / total_updates) where `schedule` is `linear`. Raises `ConfigError` where `total_updates` is
+    below 1.
     """
     if total_updates < 1:
         raise ConfigError(f"total_updates={total_updates}: accepted is an integer >= 1")
 
     def schedule(count):
-        if learner.schedule == "constant":
-            return learner.learning_rate
-        # The subtraction is in integers: the rate ends at 0 exactly, and never below.
-        return learner.learning_rate * (jnp.maximum(total_updates - count, 0) / total_updates)
+        rate = learner.learning_rate
+        if learner.warmup_updates:
+            rate *= jnp.minimum((count + 1) / learner.warmup_updates, 1.0)
+        if learner.schedule == "linear":
+            # The subtraction is in integers: the rate ends at 0 exactly, and never below.
+            rate *= jnp.maximum(total_updates - count, 0) / total_updates
+        return rate
 
     return amsgrad(
         schedule,

@@ -13,7 +13,7 @@ from foajax.optimizer import make_optimizer
 
 UPDATES = 200
 SHAPES = {"dense": {"kernel": (5, 3), "bias": (3,)}, "scale": ()}
-PLAIN = LearnerConfig(learning_rate=0.01, max_grad_norm=None)
+PLAIN = LearnerConfig(learning_rate=0.01, warmup_updates=0, max_grad_norm=None)
 
 
 def is_shape(x):
@@ -145,6 +145,18 @@ def test_linear_schedule_ends_at_total_updates():
         updates, state = optimizer.update(jnp.ones(1), state)
         sizes.append(-float(updates[0]))
     np.testing.assert_allclose(sizes, [0.01, 0.0075, 0.005, 0.0025, 0, 0], rtol=1e-6)
+
+
+def test_warmup_rises_to_the_rate_and_joins_the_schedule():
+    learner = dataclasses.replace(PLAIN, warmup_updates=4, adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30)
+    for schedule, expected in (("constant", [1, 2, 3, 4, 4, 4]), ("linear", [1, 2 * 0.9, 3 * 0.8, 4 * 0.7, 4 * 0.6, 2])):
+        optimizer = make_optimizer(dataclasses.replace(learner, schedule=schedule), 10)
+        state = optimizer.init(jnp.zeros(1))
+        sizes = []
+        for _ in range(6):
+            updates, state = optimizer.update(jnp.ones(1), state)
+            sizes.append(-float(updates[0]))
+        np.testing.assert_allclose(sizes, 0.0025 * np.array(expected), rtol=1e-6)
 
 
 def test_state_survives_being_stored_and_fits_every_configuration():

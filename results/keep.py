@@ -1,0 +1,104 @@
+"""`python results/keep.py run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/`.
+
+Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
+json=<run>/score.json` has found, and `run.json`: command, commits, seed, machine, hours. Then the tables and the
+learning curves of all kept runs are made anew. Without `run=`, only that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from foajax import cli
+from foajax.config import ConfigError, to_mapping
+from foajax.curves import RunData, colours_of, draw_curves, read_run
+from foajax.foveation import pixel_count
+
+KEPT = Path(__file__).parent / "runs"
+_ROWS = 500
+_MACHINE = ("cpu", "cores", "system", "python", "packages")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    run: str | None = None  # a run's directory
+    name: str | None = None  # of the directory that it is kept in; null for <game>-<experiment>-s<seed>
+
+
+def keep(path: Path, name: str | None) -> Path:
+    """Copies what matters of a run."""
+    run = read_run(path)
+    if run.evaluation is None:
+        raise ConfigError(f"run={path}: score.json is missing; evaluate run={path} json={path}/score.json writes it")
+    config = dataclasses.replace(run.config, run=None)
+    out = KEPT / (name or Path(config.run_dir).name)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "config.yaml").write_text(yaml.safe_dump(to_mapping(config), sort_keys=False))
+    rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
+    chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
+    (out / "metrics.jsonl").write_text("".join(rows[i] for i in chosen))
+    (out / "score.json").write_text(json.dumps(run.evaluation | {"run": out.name}, indent=1) + "\n")
+    (out / "run.json").write_text(json.dumps(_facts(run), indent=1) + "\n")
+    return out
+
+
+def _facts(run: RunData) -> dict[str, Any]:
+    starts = json.loads((run.path / "run.json").read_text())["starts"]
+    words = [word for word in starts[-1]["command"] if "=" in word and not word.startswith("run=")]
+    return {
+        "command": " ".join(["python -m foajax.train", *words]),
+        "starts": [{"time": start["time"], "commit": start["commit"]} for start in starts],
+        "seed": run.config.seed,
+        "env_steps": int(run.env_steps[-1]),
+        "hours": round(float(run.time[-1]) / 3600, 2),
+        **{key: starts[-1][key] for key in _MACHINE},
+    }
+
+
+def row(run: RunData) -> list[str]:
+    """A line of the table."""
+    facts, score = json.loads((run.path / "run.json").read_text()), run.evaluation or {}
+    values = pixel_count(run.config.sensor, run.config.env.frame_shape).nominal
+    return [
+        run.config.game,
+        f"`{run.config.name}`",
+        str(values),
+        run.config.gaze.mode,
+        f"{facts['env_steps'] / 1e6:.1f} M",
+        f"{facts['hours']:.1f}",
+        f"{score['mean']:.1f} ± {score['stderr']:.1f}",
+        f"[{run.path.name}]({run.path.name})",
+    ]
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command."""
+    options = cli.parse(Options, arguments)
+    if options.run is not None:
+        print(keep(Path(options.run), options.name))
+    runs = sorted((read_run(path) for path in KEPT.iterdir() if path.is_dir()), key=lambda run: run.config.game)
+    head = ["game", "experiment", "values", "gaze", "env_steps", "hours", "score", "kept in"]
+    lines = [head, ["---"] * len(head), *map(row, runs)]
+    intro = "Score: mean and standard error over whole games, unclipped, sampled policy. Made by `results/keep.py`."
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    (KEPT / "README.md").write_text(f"# Finished runs\n{intro}\n\n{table}\n")
+    for game in {run.config.game for run in runs}:
+        groups: dict[str, list[RunData]] = {}
+        for run in runs:
+            if run.config.game == game:
+                groups.setdefault(run.config.name, []).append(run)
+        draw_curves(groups, game, colours_of(groups)).savefig(KEPT / f"{game}.png", dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))
