@@ -1,12 +1,12 @@
 """Does a long run stay as it began: memory, speed, open files?
 
-    python benchmarks/soak.py [minutes=30] [out=soak.json] [experiment=... game=... and other keys of a run]
+    python benchmarks/soak.py [minutes=30] [out=soak.json] [run=<dir>] [experiment=... and other keys of a run]
 
-Trains in a process of its own and reads /proc while it does. What counts as the beginning is the minute after the
-first sixth of the time (of 30 minutes the first 5: compilation, and buffers that fill once), what counts as the end
-is the last one (of shorter trials a thirtieth of the time each, and speed over a sixth). Exit code 1 if resident
-memory has grown by more than 2 %, speed has fallen by more than 5 %, or there are more open files or threads than at
-the beginning. Linux only; run it on an otherwise idle machine.
+Trains in a process of its own, a new run or the one in `run`, and reads /proc while it does. What counts as the
+beginning is the minute after the first sixth of the time (of 30 minutes the first 5: compilation, and buffers that
+fill once), what counts as the end is the last one (of shorter trials a thirtieth of the time each, and speed over a
+sixth). Exit code 1 if resident memory has grown by more than 2 %, speed has fallen by more than 5 %, or there are
+more open files or threads than at the beginning. Linux only; run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -91,6 +91,8 @@ def complaints(result: dict[str, float]) -> list[str]:
 def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample], list[dict], int]:
     """Trains for `seconds`; returns the samples, the rows of metrics and the exit code."""
     command = [sys.executable, "-m", "foajax.train", *words, f"run={run}", "train.env_steps=2000000000"]
+    file = run / "metrics.jsonl"
+    before = len(file.read_text().splitlines()) if file.exists() else 0
     begin = time.monotonic()
     with (run.parent / "log").open("w") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
         samples = []
@@ -103,16 +105,17 @@ def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample]
     if code:
         print((run.parent / "log").read_text(), file=sys.stderr)
         return samples, [], code
-    return samples, [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()], 0
+    return samples, [json.loads(line) for line in file.read_text().splitlines()[before:]], 0
 
 
 def main(words: Sequence[str]) -> int:
     """The command."""
-    options = dict(word.split("=", 1) for word in words if word.startswith(("minutes=", "out=")))
+    ours = ("minutes=", "out=", "run=")
+    options = dict(word.split("=", 1) for word in words if word.startswith(ours))
     seconds = 60 * float(options.get("minutes", 30))
-    rest = [word for word in words if not word.startswith(("minutes=", "out="))]
+    rest = [word for word in words if not word.startswith(ours)]
     with tempfile.TemporaryDirectory() as directory:
-        samples, rows, code = train(rest, Path(directory) / "run", seconds)
+        samples, rows, code = train(rest, Path(options.get("run", f"{directory}/run")), seconds)
     if code:
         return code
     result = verdict(samples, rows, seconds)
@@ -122,7 +125,8 @@ def main(words: Sequence[str]) -> int:
     found = complaints(result)
     print("; ".join(found) or f"as it began, after {seconds / 60:g} minutes and {rows[-1]['env_steps']:,} env_steps")
     if "out" in options:
-        machine = {"machine": platform.platform(), "cores": os.cpu_count(), "jax": version("jax"), "words": rest}
+        cores = len(os.sched_getaffinity(0))
+        machine = {"machine": platform.platform(), "cores": cores, "jax": version("jax"), "words": rest}
         report = machine | {"seconds": seconds, "result": result, "samples": samples}
         Path(options["out"]).write_text(json.dumps(report) + "\n")
     return 1 if found else 0

@@ -264,7 +264,7 @@ def _describe_start(command: Sequence[str]) -> dict[str, Any]:
         "process": os.getpid(),
         "system": platform.platform(),
         "cpu": _cpu(),
-        "cores": os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
     }
 
 

@@ -149,7 +149,10 @@ def test_linear_schedule_ends_at_total_updates():
 
 def test_warmup_rises_to_the_rate_and_joins_the_schedule():
     learner = dataclasses.replace(PLAIN, warmup_updates=4, adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30)
-    for schedule, expected in (("constant", [1, 2, 3, 4, 4, 4]), ("linear", [1, 2 * 0.9, 3 * 0.8, 4 * 0.7, 4 * 0.6, 2])):
+    for schedule, expected in (
+        ("constant", [1, 2, 3, 4, 4, 4]),
+        ("linear", [1, 2 * 0.9, 3 * 0.8, 4 * 0.7, 4 * 0.6, 2]),
+    ):
         optimizer = make_optimizer(dataclasses.replace(learner, schedule=schedule), 10)
         state = optimizer.init(jnp.zeros(1))
         sizes = []
