@@ -89,8 +89,8 @@ def test_a_sensor_kind_states_every_key_and_the_dataclass_default(name, sensor):
     assert stated == known
 
 
-def test_the_experiments_are_the_papers_their_packed_layouts_and_the_log_polar_one():
-    assert list_experiments() == sorted([*TABLE_II, *PACKED, "logpolar"])
+def test_the_experiments_are_the_papers_their_packed_layouts_and_our_own():
+    assert list_experiments() == sorted([*TABLE_II, *PACKED, "logpolar", "seek"])
 
 
 @pytest.mark.parametrize("name", list_experiments())
@@ -100,6 +100,9 @@ def test_an_experiment_has_its_name_and_its_sensor(name):
     assert config.gaze.mode == ("none" if name == "nonfoa" else "learned")
     if name == "logpolar":
         assert nominal_values(config.sensor) == 1225 and config.gaze.bounds == "point"
+        return
+    if name == "seek":
+        assert config.game == "seek" and config.sensor.window == (16, 16)
         return
     window, values, peripheral = TABLE_II[name.removesuffix("_packed")]
     assert config.sensor.window == window
