@@ -54,7 +54,7 @@ def keep(path: Path, name: str | None) -> Path:
 
 def _facts(run: RunData) -> dict[str, Any]:
     starts = json.loads((run.path / "run.json").read_text())["starts"]
-    words = [word for word in starts[-1]["command"] if "=" in word and not word.startswith("run=")]
+    words = [word for word in starts[0]["command"] if "=" in word and not word.startswith("run=")]
     return {
         "command": " ".join(["python -m foajax.train", *words]),
         "starts": [{"time": start["time"], "commit": start["commit"]} for start in starts],
