@@ -39,7 +39,7 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
         raise ConfigError(f"total_updates={total_updates}: accepted is an integer >= 1")
 
     def schedule(count):
-        rate = learner.learning_rate
+        rate: Array | float = learner.learning_rate
         if learner.warmup_updates:
             rate *= jnp.minimum((count + 1) / learner.warmup_updates, 1.0)
         if learner.schedule == "linear":
