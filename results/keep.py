@@ -21,6 +21,7 @@ from foajax import cli
 from foajax.config import ConfigError, to_mapping
 from foajax.curves import RunData, colours_of, draw_curves, read_run
 from foajax.foveation import pixel_count
+from foajax.report import games_of
 
 KEPT = Path(__file__).parent / "runs"
 _ROWS = 500
@@ -92,11 +93,7 @@ def main(arguments: Sequence[str]) -> None:
     intro = "Score: mean and standard error over whole games, unclipped, sampled policy. Made by `results/keep.py`."
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     (KEPT / "README.md").write_text(f"# Finished runs\n{intro}\n\n{table}\n")
-    for game in {run.config.game for run in runs}:
-        groups: dict[str, list[RunData]] = {}
-        for run in runs:
-            if run.config.game == game:
-                groups.setdefault(run.config.name, []).append(run)
+    for game, groups in games_of(runs, None).items():
         draw_curves(groups, game, colours_of(groups)).savefig(KEPT / f"{game}.png", dpi=110)
 
 

@@ -136,30 +136,30 @@ def test_maximum_outlives_a_large_gradient():
 # ----- schedule, state, errors
 
 
-def test_linear_schedule_ends_at_total_updates():
-    learner = dataclasses.replace(PLAIN, schedule="linear", adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30)
-    optimizer = make_optimizer(learner, 4)
+def rates(total_updates, **learner):
+    """The learning rates of six updates: without averages and eps an update is its rate."""
+    learner = dataclasses.replace(PLAIN, adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30, **learner)
+    optimizer = make_optimizer(learner, total_updates)
     state = optimizer.init(jnp.zeros(1))
     sizes = []
     for _ in range(6):
         updates, state = optimizer.update(jnp.ones(1), state)
         sizes.append(-float(updates[0]))
-    np.testing.assert_allclose(sizes, [0.01, 0.0075, 0.005, 0.0025, 0, 0], rtol=1e-6)
+    return sizes
+
+
+def test_linear_schedule_ends_at_total_updates():
+    np.testing.assert_allclose(rates(4, schedule="linear"), [0.01, 0.0075, 0.005, 0.0025, 0, 0], rtol=1e-6)
 
 
 def test_warmup_rises_to_the_rate_and_joins_the_schedule():
-    learner = dataclasses.replace(PLAIN, warmup_updates=4, adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30)
     for schedule, expected in (
         ("constant", [1, 2, 3, 4, 4, 4]),
         ("linear", [1, 2 * 0.9, 3 * 0.8, 4 * 0.7, 4 * 0.6, 2]),
     ):
-        optimizer = make_optimizer(dataclasses.replace(learner, schedule=schedule), 10)
-        state = optimizer.init(jnp.zeros(1))
-        sizes = []
-        for _ in range(6):
-            updates, state = optimizer.update(jnp.ones(1), state)
-            sizes.append(-float(updates[0]))
-        np.testing.assert_allclose(sizes, 0.0025 * np.array(expected), rtol=1e-6)
+        np.testing.assert_allclose(
+            rates(10, schedule=schedule, warmup_updates=4), 0.0025 * np.array(expected), rtol=1e-6
+        )
 
 
 def test_state_survives_being_stored_and_fits_every_configuration():
