@@ -43,6 +43,10 @@ class Agent:
         """Parameters before any learning."""
         return networks.initial_params(self.network, key, self.config)
 
+    def initial_statistics(self) -> FrameStatistics:
+        """Frame statistics before any frame."""
+        return frames.initial_statistics(self.config.env.frame_shape if self._by_pixel else ())
+
     def initial_state(self, batch: int) -> ActorState:
         """State of `batch` actors before their first episode; `is_first` of the first step completes it."""
         return ActorState(
@@ -70,7 +74,10 @@ class Agent:
         keys = jax.random.split(key, actors) if key.ndim == 0 else key
         start_key, natural_key, vision_key = jax.vmap(lambda k: jax.random.split(k, 3), out_axes=1)(keys)
         frame = self.frame(timestep.frame)
-        frame_mean, frame_std = jax.vmap(frames.frame_statistics)(frame)
+        if self._by_pixel:
+            frame_mean, frame_std = jax.vmap(lambda f: frames.pixel_statistics(f, statistics))(frame)
+        else:
+            frame_mean, frame_std = jax.vmap(frames.frame_statistics)(frame)
         frame = self.normalise(frame, statistics)
         focal_point, age = self.look(start_key, state, timestep)
         roi = self.sense(frame, focal_point)
@@ -149,6 +156,10 @@ class Agent:
     def unit(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
         """Focal points in [-1, 1]."""
         return gaze.to_unit(focal_point, self.config.env.frame_shape)
+
+    @property
+    def _by_pixel(self) -> bool:
+        return self.config.network.normalization == "pixel"
 
     @property
     def _gaze(self) -> dict:

@@ -156,7 +156,7 @@ class NetworkConfig:
     torso: Literal["nature", "a3c"] = "nature"
     dense: int = 256  # units between torso and LSTM; 0 for none
     lstm: int = 256
-    normalization: Literal["running", "frame", "none"] = "running"
+    normalization: Literal["running", "pixel", "frame", "none"] = "running"
 
     def __post_init__(self) -> None:
         _check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")

@@ -10,11 +10,12 @@ import math
 from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from foajax.types import FrameStatistics
 
 DECAY = 0.9999  # of the running statistics, per frame
+PIXEL_DECAY = 0.99999  # where each pixel has a mean of its own, which takes more frames to know
 EPSILON = 1e-8  # added to a deviation before dividing by it
 CROPPED = 160  # rows, and columns, kept of an Atari screen
 
@@ -66,46 +67,46 @@ def frame_statistics(frame: Float[Array, "H W"]) -> tuple[Float[Array, ""], Floa
     return mean, jnp.sqrt(jnp.mean(jnp.square(frame - mean)))
 
 
-def initial_statistics() -> FrameStatistics:
+def pixel_statistics(
+    frame: Float[Array, "H W"], statistics: FrameStatistics
+) -> tuple[Float[Array, "H W"], Float[Array, ""]]:
+    """One frame's part in statistics whose mean is by pixel: itself, and its deviation from the mean so far."""
+    mean, _ = _corrected(statistics, frame)
+    return frame, jnp.sqrt(jnp.mean(jnp.square(frame - mean)))
+
+
+def initial_statistics(mean_shape: tuple[int, ...] = ()) -> FrameStatistics:
     """Running statistics that have seen nothing: all zeros."""
     zero = jnp.zeros((), jnp.float32)
-    return FrameStatistics(mean=zero, std=zero, weight=zero)
+    return FrameStatistics(mean=jnp.zeros(mean_shape, jnp.float32), std=zero, weight=zero)
 
 
 def update_statistics(
     statistics: FrameStatistics,
-    frame_mean: Float[Array, "N"],
-    frame_std: Float[Array, "N"],
-    valid: Bool[Array, "N"] | Float[Array, "N"] | None = None,
+    frame_mean: Float[Array, "*mean"],
+    frame_std: Float[Array, ""],
+    count: Int[Array, ""] | int,
 ) -> FrameStatistics:
-    """Takes N frames into the running statistics at once.
+    """Takes `count` frames into the running statistics at once, each as the average of all of them.
 
-    One frame at a time, `mean <- DECAY mean + (1 - DECAY) frame_mean`. The n valid frames of a
-    batch count as n times their average, so that their order has no influence:
-    `mean <- DECAY^n mean + (1 - DECAY^n) average`; the same for `std` and, with 1 as the average,
-    for `weight`.
+    One frame at a time, `mean <- DECAY mean + (1 - DECAY) frame_mean`; n times that is
+    `mean <- DECAY^n mean + (1 - DECAY^n) average`, and the order of a batch's frames has no influence. The
+    same for `std` and, with 1 as the average, for `weight`.
 
     Args:
       statistics: what has been seen so far.
-      frame_mean, frame_std: of each frame, from `frame_statistics`.
-      valid: 1 or True where a frame counts; None for all.
+      frame_mean, frame_std: averages of what `frame_statistics` or `pixel_statistics` give for the frames.
+      count: how many frames; with 0 nothing changes.
 
     Returns:
-      The new statistics; the old ones if no frame is valid.
+      The new statistics.
     """
-    counted = jnp.ones_like(frame_mean) if valid is None else valid.astype(frame_mean.dtype)
-    count = jnp.sum(counted)
-    log_decay = count * math.log(DECAY)
+    log_decay = count * math.log(PIXEL_DECAY if statistics.mean.ndim else DECAY)
     # expm1, because 1 - DECAY^n loses half of float32's digits for small n.
     old, new = jnp.exp(log_decay), -jnp.expm1(log_decay)
-
-    def average(values: Float[Array, "N"]) -> Float[Array, ""]:
-        # A frame that does not count may hold anything, NaN included.
-        return jnp.sum(jnp.where(counted > 0, values, 0.0)) / jnp.maximum(count, 1.0)
-
     return FrameStatistics(
-        mean=old * statistics.mean + new * average(frame_mean),
-        std=old * statistics.std + new * average(frame_std),
+        mean=old * statistics.mean + new * frame_mean,
+        std=old * statistics.std + new * frame_std,
         weight=old * statistics.weight + new,
     )
 
@@ -114,26 +115,30 @@ def normalise(
     frame: Float[Array, "H W"],
     statistics: FrameStatistics,
     *,
-    mode: Literal["running", "frame", "none"],
+    mode: Literal["running", "pixel", "frame", "none"],
 ) -> Float[Array, "H W"]:
     """(frame - mean) / (std + EPSILON).
 
     Args:
       frame: in [0, 1].
-      statistics: the running statistics, not yet bias-corrected; read by `running` only.
-      mode: whose mean and deviation. `running`: those of `statistics`, bias-corrected, or the
-        frame's own while nothing has been seen; `frame`: the frame's own; `none`: the frame is
-        returned as it is.
+      statistics: the running statistics, not yet bias-corrected; read by `running` and `pixel` only.
+      mode: whose mean and deviation. `running` and `pixel`: those of `statistics`, bias-corrected, or
+        the frame's own while nothing has been seen; with `pixel`, each pixel has a mean of its own,
+        so that what never changes is 0. `frame`: the frame's own; `none`: the frame is returned as
+        it is.
 
     Returns:
       The normalised frame, without bounds unless `none`.
     """
     if mode == "none":
         return frame
-    mean, std = frame_statistics(frame)
-    if mode == "running":
-        seen = statistics.weight > 0
-        weight = jnp.where(seen, statistics.weight, 1.0)
-        mean = jnp.where(seen, statistics.mean / weight, mean)
-        std = jnp.where(seen, statistics.std / weight, std)
+    mean, std = frame_statistics(frame) if mode == "frame" else _corrected(statistics, frame)
     return (frame - mean) / (std + EPSILON)
+
+
+def _corrected(statistics: FrameStatistics, frame: Float[Array, "H W"]) -> tuple[Array, Array]:
+    """Mean and deviation without the bias of the zeros at the start; the frame's own while nothing has been seen."""
+    mean, std = frame_statistics(frame)
+    seen = statistics.weight > 0
+    weight = jnp.where(seen, statistics.weight, 1.0)
+    return jnp.where(seen, statistics.mean / weight, mean), jnp.where(seen, statistics.std / weight, std)

@@ -20,7 +20,7 @@ from foajax.agent import Agent
 from foajax.config import HeadConfig, LearnerConfig
 from foajax.types import Params, Rollout, TrainState
 
-Metrics = dict[str, Float[Array, ""]]
+Metrics = dict[str, Float[Array, "..."]]
 
 
 def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs, key: PRNGKeyArray) -> TrainState:
@@ -29,7 +29,7 @@ def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs
     return TrainState(
         params=params,
         opt_state=optimizer.init(params),
-        statistics=frames.initial_statistics(),
+        statistics=agent.initial_statistics(),
         updates=jnp.zeros((), jnp.int32),
         skipped=jnp.zeros((), jnp.int32),
     )
@@ -164,6 +164,7 @@ def _head_loss(
     entropy = losses.entropy(logits)
     total = policy - head.beta * entropy + config.value_weight * error
     metrics = {"policy_loss": mean(policy), "value_loss": mean(error), "entropy": mean(entropy), "value": mean(value)}
+    metrics["policy"] = jax.vmap(mean, in_axes=-1)(jax.nn.softmax(logits))
     return reduce(total, reduction=config.reduction), metrics
 
 
@@ -173,6 +174,18 @@ def _whole(parts: Any, axis: str | None) -> Any:
         return parts
     flat, restore = ravel_pytree(parts)
     return restore(jax.lax.psum(flat, axis))
+
+
+def _with_information(metrics: Metrics) -> Metrics:
+    """Each head's mean `policy` replaced by `information`: what its decisions tell of what was seen, in nats.
+
+    The entropy of the mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
+    """
+    kept = {name: value for name, value in metrics.items() if not name.endswith("_policy")}
+    for name in metrics.keys() - kept.keys():
+        head, p = name.removesuffix("_policy"), metrics[name]
+        kept[f"{head}_information"] = jnp.sum(jnp.where(p > 0, -p * jnp.log(p), 0.0)) - metrics[f"{head}_entropy"]
+    return kept
 
 
 def update(
@@ -197,15 +210,15 @@ def update(
     metrics are those of the whole, the same on every device.
     """
     part = minibatch(rollout, index, size)
-    frame_mean, frame_std = (x[:-1].reshape(-1) for x in (part.steps.frame_mean, part.steps.frame_std))
+    frames_seen = part.steps.frame_std[:-1].size
+    averages = tuple(jnp.mean(x[:-1], (0, 1)) for x in (part.steps.frame_mean, part.steps.frame_std))
     results = jax.grad(loss, has_aux=True)(state.params, agent, part, axis=axis)
     if axis:
         shards = jax.lax.axis_size(axis)
-        averages = (jnp.mean(frame_mean) / shards, jnp.mean(frame_std) / shards)
-        results, averages = _whole((results, averages), axis)
-        # Frames count as often as there are some, each as the average of all.
-        frame_mean, frame_std = (jnp.full(frame_mean.size * shards, average) for average in averages)
+        results, averages = _whole((results, jax.tree.map(lambda x: x / shards, averages)), axis)
+        frames_seen *= shards
     gradient, metrics = results
+    metrics = _with_information(metrics)
     grad_norm = optax.tree.norm(gradient)
     accept = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
     change, opt_state = optimizer.update(gradient, state.opt_state, state.params, accept=accept)
@@ -215,9 +228,7 @@ def update(
     params = jax.tree.map(lambda new, old: jnp.where(finite, new, old), params, state.params)
     opt_state = opt_state._replace(count=state.opt_state.count + finite)
     most = agent.config.learner.max_grad_norm
-    statistics = frames.update_statistics(
-        state.statistics, frame_mean, frame_std, jnp.broadcast_to(is_first_pass, frame_mean.size)
-    )
+    statistics = frames.update_statistics(state.statistics, *averages, is_first_pass * frames_seen)
     skipped = jnp.where(finite, 0, state.skipped + 1)
     updates = state.updates + 1
     metrics |= {

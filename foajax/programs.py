@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Int, Key
 
-from foajax import frames, learner
+from foajax import learner
 from foajax.agent import Agent
 from foajax.optimizer import make_optimizer
 from foajax.sharding import BATCH, DATA, EVERYWHERE, ROLLOUT, Layout
@@ -84,7 +84,7 @@ def empty_rollout(agent: Agent, batch: int, timestep: TimeStep) -> Rollout:
     shapes = jax.eval_shape(
         lambda: agent.act(
             agent.initial_params(jax.random.key(0)),
-            frames.initial_statistics(),
+            agent.initial_statistics(),
             actor_state,
             jax.tree.map(jnp.asarray, timestep),
             jax.random.key(0),

@@ -67,7 +67,7 @@ class ActorOutput(NamedTuple):
     reward: Float[Array, "B"]  # of the time step acted on
     is_first: Bool[Array, "B"]
     is_terminal: Bool[Array, "B"]
-    frame_mean: Float[Array, "B"]  # of the frame before normalisation, for the running statistics
+    frame_mean: Float[Array, "B *mean"]  # of the frame before normalisation, for the running statistics
     frame_std: Float[Array, "B"]
 
 
@@ -79,9 +79,9 @@ class Rollout(NamedTuple):
 
 
 class FrameStatistics(NamedTuple):
-    """Running mean and deviation of the frames, one scalar each, not yet bias-corrected."""
+    """Running mean and deviation of the frames, not yet bias-corrected."""
 
-    mean: Float[Array, ""]
+    mean: Float[Array, "*mean"]  # one number, or one a pixel
     std: Float[Array, ""]
     weight: Float[Array, ""]  # 1 - decay^count: what the corrected values are divided by
 

@@ -113,7 +113,7 @@ def test_single_frames_follow_the_recursion(maybe_jit):
     update = maybe_jit(frames.update_statistics)
     statistics = frames.initial_statistics()
     for m, s in zip(mean, std, strict=True):
-        statistics = update(statistics, jnp.asarray([m]), jnp.asarray([s]))
+        statistics = update(statistics, jnp.asarray(m), jnp.asarray(s), 1)
     np.testing.assert_allclose((statistics.mean, statistics.weight), frame_by_frame(mean), rtol=1e-5)
     np.testing.assert_allclose((statistics.std, statistics.weight), frame_by_frame(std), rtol=1e-5)
 
@@ -121,31 +121,41 @@ def test_single_frames_follow_the_recursion(maybe_jit):
 def test_a_batch_of_equal_frames_is_as_many_updates(maybe_jit):
     update = maybe_jit(frames.update_statistics)
     start = FrameStatistics(mean=jnp.float32(0.2), std=jnp.float32(0.1), weight=jnp.float32(0.5))
-    at_once = update(start, jnp.full(640, 0.3), jnp.full(640, 0.4))
+    at_once = update(start, *jnp.array([0.3, 0.4]), 640)
     one_by_one = start
     for _ in range(640):
-        one_by_one = update(one_by_one, jnp.full(1, 0.3), jnp.full(1, 0.4))
+        one_by_one = update(one_by_one, *jnp.array([0.3, 0.4]), 1)
     np.testing.assert_allclose(np.asarray(at_once), np.asarray(one_by_one), rtol=1e-4)
     np.testing.assert_allclose(at_once.weight, 1 - 0.5 * frames.DECAY**640, rtol=1e-6)
 
 
 def test_corrected_statistics_of_the_first_batch_are_its_average(maybe_jit):
-    mean, std = jnp.asarray([0.1, 0.2, 0.6]), jnp.asarray([0.3, 0.1, 0.2])
-    statistics = maybe_jit(frames.update_statistics)(frames.initial_statistics(), mean, std)
+    statistics = maybe_jit(frames.update_statistics)(frames.initial_statistics(), *jnp.array([0.3, 0.2]), 3)
     np.testing.assert_allclose(statistics.mean / statistics.weight, 0.3, rtol=1e-6)
     np.testing.assert_allclose(statistics.std / statistics.weight, 0.2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [bool, np.float32])
-def test_frames_that_do_not_count_leave_no_trace(maybe_jit, dtype):
+def test_no_frames_leave_no_trace(maybe_jit):
     update = maybe_jit(frames.update_statistics)
-    start = update(frames.initial_statistics(), jnp.asarray([0.4]), jnp.asarray([0.2]))
-    mean, std = jnp.asarray([0.1, jnp.nan, 0.5]), jnp.asarray([0.2, jnp.inf, 0.4])
-    some = update(start, mean, std, jnp.asarray(np.array([1, 0, 1], dtype)))
-    expected = update(start, mean[::2], std[::2])
-    np.testing.assert_allclose(np.asarray(some), np.asarray(expected), rtol=1e-7)
-    none = update(start, mean, std, jnp.asarray(np.zeros(3, dtype)))
-    np.testing.assert_array_equal(np.asarray(none), np.asarray(start))
+    start = update(frames.initial_statistics(), *jnp.array([0.4, 0.2]), 1)
+    np.testing.assert_array_equal(np.asarray(update(start, *jnp.array([0.1, 0.7]), 0)), np.asarray(start))
+
+
+def test_by_pixel_what_never_changes_becomes_zero_and_the_rest_has_unit_deviation(maybe_jit):
+    rng = np.random.default_rng(5)
+    screens = np.tile(rng.random((8, 8), np.float32), (500, 1, 1))
+    moving = np.zeros((8, 8), bool)
+    moving[2:4, 3:7] = True
+    screens[:, moving] = rng.random((500, 8), np.float32)
+    see = maybe_jit(lambda s, f: frames.update_statistics(s, *frames.pixel_statistics(f, s), 1))
+    statistics = frames.initial_statistics((8, 8))
+    for screen in screens:
+        statistics = see(statistics, jnp.asarray(screen))
+    np.testing.assert_allclose(statistics.weight, 1 - frames.PIXEL_DECAY**500, rtol=1e-5)
+    np.testing.assert_allclose(statistics.mean / statistics.weight, screens.mean(0), rtol=1e-2)
+    got = jnp.stack([frames.normalise(jnp.asarray(s), statistics, mode="pixel") for s in screens[::10]])
+    np.testing.assert_allclose(got[:, ~moving], 0.0, atol=1e-3)
+    np.testing.assert_allclose(np.std(got), 1.0, atol=0.1)
 
 
 def test_running_normalisation_divides_by_the_weight(maybe_jit):
@@ -162,10 +172,11 @@ def test_frame_normalisation_gives_mean_zero_and_deviation_one(maybe_jit):
     np.testing.assert_allclose((np.mean(got), np.std(got)), (0.0, 1.0), atol=1e-5)
 
 
-def test_running_normalisation_of_the_very_first_frame_uses_its_own_statistics(maybe_jit):
+@pytest.mark.parametrize(("mode", "mean_shape"), [("running", ()), ("pixel", (8, 8))])
+def test_normalisation_of_the_very_first_frame_uses_its_own_statistics(maybe_jit, mode, mean_shape):
     frame = jnp.asarray(np.random.default_rng(4).random((8, 8), np.float32))
-    start = frames.initial_statistics()
-    running = maybe_jit(lambda f, s: frames.normalise(f, s, mode="running"))(frame, start)
+    start = frames.initial_statistics(mean_shape)
+    running = maybe_jit(lambda f, s: frames.normalise(f, s, mode=mode))(frame, start)
     own = maybe_jit(lambda f, s: frames.normalise(f, s, mode="frame"))(frame, start)
     np.testing.assert_array_equal(running, own)
 
