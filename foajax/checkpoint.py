@@ -15,6 +15,7 @@ pickles or any other format that can carry code.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -22,14 +23,16 @@ import re
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint._src.multihost import multihost
 
 from foajax import durable
 from foajax.config import ConfigError
@@ -256,11 +259,19 @@ def _copy(leaf: Any) -> Any:
     return jax.device_put(jax.random.key_data(leaf) if _is_key(leaf) else leaf, may_alias=False)
 
 
-def _orbax() -> ocp.Checkpointer:
-    """Orbax for this process alone: it would otherwise wait for all that share a run, of which one keeps the files."""
-    alone = ocp.options.MultiprocessingOptions(primary_host=jax.process_index(), active_processes={jax.process_index()})
+@contextlib.contextmanager
+def _orbax() -> Iterator[ocp.Checkpointer]:
+    """Orbax for this process alone: it would otherwise wait for all that share a run, of which one keeps the files.
+
+    What its options leave open: arrays of the host are written by process 0 only, whoever the primary host is.
+    """
+    alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0})
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
-    return ocp.Checkpointer(handler, multiprocessing_options=alone)
+    with (
+        mock.patch.object(multihost, "process_index", lambda: 0),
+        ocp.Checkpointer(handler, multiprocessing_options=alone) as orbax,
+    ):
+        yield orbax
 
 
 def _claim(path: Path, size: int) -> None:

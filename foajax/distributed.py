@@ -6,25 +6,31 @@ others get from it, so that no shared file system is needed.
 
 A process that dies or hangs leaves the others waiting in a collective. They are watched from a thread: where a
 process has waited for `distributed.timeout`, or a collective fails, process 0 writes what all had agreed on last as
-a checkpoint, everyone says why in one line and ends with exit code 75 (try again).
+a checkpoint, everyone says why in one line and ends with exit code 75 (try again). Where process 0 is the one that
+died, another that sees the run's directory writes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jaxlib import _jax
 
+from foajax import coordinator
 from foajax.config import Config, ConfigError, check_shares
 
 EXIT_CODE = 75  # the system's "temporary failure": start the same command again
@@ -102,11 +108,31 @@ def start(config: Config) -> Job:
         jax.config.update("jax_enable_preemption_service", False)
         keepalive = math.ceil(_KEEPALIVE * config.distributed.timeout)
         try:
-            jax.distributed.initialize(**where, initialization_timeout=_STARTING, heartbeat_timeout_seconds=keepalive)
+            with mock.patch.object(_jax, "get_distributed_runtime_service", _Service):
+                jax.distributed.initialize(
+                    **where, initialization_timeout=_STARTING, heartbeat_timeout_seconds=keepalive
+                )
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
             raise ConfigError(f"distributed={where}: accepted is what all processes can reach ({reason})") from None
     return Job(config)
+
+
+class _Service:
+    """JAX's coordination service, which process 0 makes and ends, in a process that outlives it."""
+
+    def __init__(self, *positional: Any, **named: Any) -> None:
+        words = [sys.executable, "-P", coordinator.__file__, json.dumps([positional, named])]
+        # It may outlive this process, and then holds nothing that others wait for the end of.
+        pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+        self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=nowhere, text=True)
+        assert self._process.stdout is not None
+        said = self._process.stdout.readline().strip()
+        if said != coordinator.READY:
+            raise RuntimeError(said or f"the coordination service ended with exit code {self._process.wait()}")
+
+    def shutdown(self) -> None:
+        self._process.communicate("done")
 
 
 def _where(config: Config) -> dict[str, Any] | None:

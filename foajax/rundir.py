@@ -116,6 +116,14 @@ def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
     return run_dir
 
 
+def take_over(path: Path) -> RunDir | None:
+    """Holds the directory of a run that nobody holds any more; None where somebody does or it cannot be seen."""
+    try:
+        return RunDir(path, _take_lock(path)) if is_run(path) else None
+    except RunError:
+        return None
+
+
 def load_config(path: str | os.PathLike[str]) -> Config:
     """The configuration of the run in `path`, with ``run`` set to `path`.
 

@@ -26,7 +26,7 @@ from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state, use_compilation_cache
 from foajax.rollout import Collector, update_on
-from foajax.rundir import RunDir, open_run
+from foajax.rundir import RunDir, open_run, take_over
 from foajax.sharding import Layout
 from foajax.snapshots import snapshots
 from foajax.store import CHECKPOINTS, save_facts
@@ -180,10 +180,12 @@ class Run:
         if compiled:
             self._watch.beat()
         now, every = time.monotonic(), self._config.distributed.timeout / 20
-        if self._job.is_first and (self._kept is None or now - self._kept_at >= every):
+        if self._kept is None or now - self._kept_at >= every:
             self._kept, self._kept_at = self._snapshot(), now
 
     def _rescue(self) -> str:
+        if self._checkpoints is None and (run_dir := take_over(Path(self._config.run_dir))):
+            self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=self._config.train.keep, warn=self._warn)
         if self._checkpoints is None:
             return "the first process saves what it can"
         if self._kept is None:

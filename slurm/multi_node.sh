@@ -20,7 +20,8 @@
 # #SBATCH --gpus-per-task=1   # one more # removed: with the extra `cuda`
 
 # Before the time is up all processes are told to save (one would do: they stop together), and the job queues itself
-# again. Exit code 75 means that a process was lost and the others saved: the job goes on from there as well.
+# again. Exit code 75 means that a process was lost and the others saved, one above 128 that it was a signal which took
+# it: the job goes on from there as well.
 trap 'again=1; kill -USR1 "$job"' USR1
 srun --kill-on-bad-exit=0 --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" \
   python -m foajax.train env.num_envs=256 env.threads="${SLURM_CPUS_PER_TASK:-1}" "$@" &
@@ -29,7 +30,7 @@ wait "$job"
 status=$?
 if [[ ${again-} ]]; then
   wait "$job" # the first wait ended with the signal
-elif ((status != 75)); then
+elif ((status != 75 && status <= 128)); then
   exit "$status"
 fi
 scontrol requeue "$SLURM_JOB_ID"

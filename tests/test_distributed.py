@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from foajax import distributed
+from foajax import coordinator, distributed
 from foajax.compose import compose
 from foajax.config import ConfigError
 from foajax.store import load_agent
@@ -117,7 +117,7 @@ def test_what_two_processes_saved_one_goes_on_with_and_the_reverse(one, two):
     assert_same(one, two)
 
 
-def lose_one(tmp_path, number, *, which=1):
+def lose_one(tmp_path, number, *, which):
     """Two endless processes, one of which gets a signal; the other's exit code and last words."""
     words = ["train.env_steps=100000000", "train.checkpoint_every=1000", "distributed.timeout=15"]
     processes = start_job(2, f"run={tmp_path}", *words)
@@ -139,16 +139,17 @@ def lose_one(tmp_path, number, *, which=1):
     return left.returncode, [line for line in err.splitlines() if line.startswith("foajax: error: ")]
 
 
-HANGS = pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)
+HANGS = pytest.param(1, signal.SIGSTOP, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, HANGS])
-def test_a_process_that_is_lost_ends_the_others_with_a_checkpoint(tmp_path, number):
-    code, lines = lose_one(tmp_path, number)
+@pytest.mark.parametrize(("which", "number"), [(1, signal.SIGKILL), (0, signal.SIGKILL), HANGS])
+def test_a_process_that_is_lost_ends_the_others_with_a_checkpoint(tmp_path, which, number):
+    """Process 0 as well, which has the run's directory and starts JAX's coordination service."""
+    code, lines = lose_one(tmp_path, number, which=which)
     assert code == 75
     (line,) = lines
     saved = max(int(path.name) for path in (tmp_path / "checkpoints").iterdir())
-    assert "process 0 of 2: another process died or hangs" in line
+    assert f"process {1 - which} of 2: another process died or hangs" in line
     assert f"saved at {saved:,} env_steps; the same command goes on from here" in line
     assert saved > 0
     assert load_agent(tmp_path).env_steps == saved
@@ -206,10 +207,28 @@ def test_a_process_whose_environment_fails_says_so_and_the_others_save(tmp_path,
     assert "; the first process saves what it can; details in " in errors[1]
 
 
+def test_a_port_that_stays_taken_is_named(monkeypatch):
+    monkeypatch.setattr(coordinator, "_LINGER", -5.0)
+    with socket.create_server(("", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(OSError, match=rf"^port {port}: Address already in use$"):
+            coordinator._wait_for(port)
+    coordinator._wait_for(port)
+
+
+def test_the_service_knows_whether_anyone_is_connected():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert not coordinator._connected(port)
+        with socket.create_connection(("127.0.0.1", port)):
+            assert coordinator._connected(port)
+
+
 @pytest.mark.slow
-def test_when_the_first_process_is_lost_the_others_end(tmp_path):
-    code, _ = lose_one(tmp_path, signal.SIGKILL, which=0)
-    assert code != 0
+def test_when_the_first_process_hangs_the_others_end(tmp_path):
+    """It may wake up again and write, so that nobody else does."""
+    code, (line,) = lose_one(tmp_path, signal.SIGSTOP, which=0)
+    assert code == 75 and "the first process saves what it can" in line
 
 
 @pytest.mark.slow
