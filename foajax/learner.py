@@ -211,7 +211,7 @@ def update(
     """
     part = minibatch(rollout, index, size)
     frames_seen = part.steps.frame_std[:-1].size
-    averages = tuple(jnp.mean(x[:-1], (0, 1)) for x in (part.steps.frame_mean, part.steps.frame_std))
+    averages = jnp.mean(part.steps.frame_mean[:-1], (0, 1)), jnp.mean(part.steps.frame_std[:-1], (0, 1))
     results = jax.grad(loss, has_aux=True)(state.params, agent, part, axis=axis)
     if axis:
         shards = jax.lax.axis_size(axis)

@@ -7,6 +7,7 @@ import pytest
 
 from foajax import compose, learner
 from foajax.agent import Agent
+from foajax.frames import PIXEL_DECAY
 from foajax.programs import make_programs, make_state
 from foajax.rollout import Collector, update_on
 from foajax.train import make_environments
@@ -172,6 +173,36 @@ def test_frames_are_counted_once_however_many_passes():
     one.run(1), two.run(1)
     np.testing.assert_allclose(one.state.statistics.weight, two.state.statistics.weight, rtol=1e-6)
     assert two.state.updates == 2 * one.state.updates
+
+
+def test_by_pixel_the_statistics_hold_the_mean_frame():
+    loop = Loop("game=seek", *VIEW, "network.normalization=pixel")
+    rollouts, _ = loop.collect()
+    seen = rollouts[0].steps.frame_mean[:-1]
+    assert seen.shape == (6, 8, 80, 80)
+    state, _ = update_on(rollouts, loop.state, loop.programs, loop.config.learner)
+    mean, _, weight = state.statistics
+    np.testing.assert_allclose(mean / weight, seen.mean((0, 1)), atol=1e-3)
+    np.testing.assert_allclose(weight, 1 - PIXEL_DECAY**48, rtol=1e-5)
+
+
+def test_information_is_what_decisions_tell_of_what_was_seen(seek):
+    """None where the policy is the same whatever is seen; all of it where every decision is certain."""
+    (rollout,), _ = seek.collect()
+
+    def information(scale):
+        state = jax.tree.map(jnp.copy, seek.state)
+        for head in ("natural", "vision"):
+            weights = state.params["params"][f"{head}_policy"]
+            weights["kernel"] = weights["kernel"] * scale
+        metrics = seek.programs.update(state, rollout, np.int32(0), np.bool_(True))[1]
+        return [metrics[f"{head}_information"] for head in ("natural", "vision")], metrics
+
+    alike, _ = information(0.0)
+    np.testing.assert_allclose(alike, 0.0, atol=1e-6)
+    certain, metrics = information(1e6)
+    assert all(value > 0.1 for value in certain)
+    np.testing.assert_allclose([metrics["natural_entropy"], metrics["vision_entropy"]], 0.0, atol=0.05)
 
 
 def test_two_groups_see_what_each_would_alone():
