@@ -221,6 +221,7 @@ class TrainConfig:
     """The loop around the learner."""
 
     env_steps: int = 5_000_000  # when to stop
+    init_from: str | None = None  # run or shipped agent whose parameters a new run begins with
     log_every: float = 10.0  # seconds
     checkpoint_every: float = 60.0  # seconds
     keep: int = 3  # newest checkpoints kept

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import yaml
 from safetensors import SafetensorError
@@ -25,7 +26,7 @@ from foajax.checkpoint import Checkpoints
 from foajax.config import ConfigError, to_mapping
 from foajax.programs import make_state
 from foajax.rundir import load_config
-from foajax.types import FrameStatistics, Params
+from foajax.types import FrameStatistics, Params, TrainState
 
 _FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
 _PARAMETERS = "agent.safetensors"
@@ -73,6 +74,27 @@ def load_agent(path: str | Path) -> Stored:
         raise ConfigError(f"run={path}: has no checkpoint yet")
     env_steps, state, _ = restored
     return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
+
+
+def begin_from(path: str, state: TrainState) -> TrainState:
+    """The state at the start of a run, with a stored agent's parameters and frame statistics.
+
+    Raises:
+      ConfigError: there is no such agent, or it has another network or other images.
+    """
+    key = f"train.init_from={path}"
+    try:
+        stored = load_agent(path)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+    there, wanted = (named((s.params, s.statistics)) for s in (stored, state))
+    for name in [*wanted, *there]:
+        have, want = (arrays[name].shape if name in arrays else None for arrays in (there, wanted))
+        if have != want:
+            accepted = "an agent with this run's sensor, network, gaze and number of actions"
+            raise ConfigError(f"{key}: {name} has the shape {have}, here it is {want}; accepted is {accepted}")
+    params, statistics = jax.tree.map(jnp.asarray, (stored.params, stored.statistics))
+    return state._replace(params=params, statistics=statistics)
 
 
 def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None = None) -> None:

@@ -29,7 +29,7 @@ from foajax.rollout import Collector, update_on
 from foajax.rundir import RunDir, open_run, take_over
 from foajax.sharding import Layout
 from foajax.snapshots import snapshots
-from foajax.store import CHECKPOINTS, save_facts
+from foajax.store import CHECKPOINTS, begin_from, save_facts
 from foajax.types import Outcome, Rollout, TrainState
 from foajax.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 
@@ -76,7 +76,10 @@ class Run:
         self._programs = make_programs(agent, self._layout)
         self._collector = Collector(agent, self._programs, environments, seed=config.seed, part=job.index)
         self._tracker = EpisodeTracker(config.env.num_envs)
-        self._state = self._on_all_devices(make_state(agent, config.seed))
+        state = make_state(agent, config.seed)
+        if config.train.init_from is not None and not self._env_steps:
+            state = begin_from(config.train.init_from, state)
+        self._state = self._on_all_devices(state)
         self._stop_agreed = False
         self._kept: tuple[int, dict[str, Any], dict[str, Any]] | None = None
         self._kept_at = 0.0
@@ -307,7 +310,9 @@ class Run:
 
     def _how_it_starts(self) -> str:
         if not self._env_steps:
-            return f"new run of {self._config.name} on {self._config.game}"
+            parameters = self._config.train.init_from
+            begins = f", from the parameters of {parameters}" if parameters else ""
+            return f"new run of {self._config.name} on {self._config.game}{begins}"
         games = "episodes go on" if self._collector.resumable else "episodes start anew, emulators cannot be saved"
         return f"resumed at {self._env_steps:,} env_steps ({games})"
 

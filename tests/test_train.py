@@ -103,6 +103,30 @@ def test_a_shipped_agent_is_the_runs(breakout, tmp_path):
     assert shipped.env_steps == stored.env_steps and shipped.agent.config.sensor == stored.agent.config.sensor
 
 
+def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path):
+    run, _ = breakout
+    words = ["experiment=constant50_sub2_packed", *TINY, f"run={tmp_path}", f"train.init_from={run}"]
+    # A step so small that it changes nothing in float32.
+    code, out, err = finish(*words, "train.env_steps=40", "learner.learning_rate=1e-30")
+    assert code == 0, err
+    assert f"new run of constant50_sub2_packed on breakout, from the parameters of {run}" in out
+    jax.tree.map(np.testing.assert_array_equal, load_agent(tmp_path).params, load_agent(run).params)
+
+
+@pytest.mark.parametrize(
+    ("source", "word", "said"),
+    [
+        ("nowhere", "seed=1", "run=nowhere: does not exist"),
+        ("breakout", "network.lstm=8", "accepted is an agent with this run's sensor, network, gaze and number of actions"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused_in_one_line(breakout, tmp_path, source, word, said):
+    words = ["experiment=constant50_sub2_packed", *TINY, f"run={tmp_path / 'new'}", word]
+    code, _, err = finish(*words, f"train.init_from={breakout[0] if source == 'breakout' else source}")
+    assert code == 2 and len(err.splitlines()) == 1 and err.startswith("foajax: error: train.init_from="), err
+    assert said in err
+
+
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
     words = ["game=seek", *TINY]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
