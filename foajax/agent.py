@@ -97,8 +97,7 @@ class Agent:
             reward=jnp.asarray(timestep.reward),
             is_first=jnp.asarray(timestep.is_first),
             is_terminal=jnp.asarray(timestep.is_terminal),
-            frame_mean=frame_mean,
-            frame_std=frame_std,
+            frames=(jnp.mean(frame_mean, axis=0, keepdims=True), jnp.mean(frame_std, keepdims=True)),
         )
         state = ActorState(
             core_state=core_state, focal_point=self.move(focal_point, vision_action, age + 1), age=age + 1

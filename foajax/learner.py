@@ -39,15 +39,16 @@ def minibatch(rollout: Rollout, index: Int[Array, ""], size: int) -> Rollout:
     """`size` environments of a rollout: every n-th column from `index` on, n = B / size.
 
     A slice of the rollout that holds a multiple of n environments thus has its share of every minibatch, and which
-    environments meet in one does not depend on how many devices share them.
+    environments meet in one does not depend on how many devices share them. The frames' averages remain the rollout's.
     """
 
     def columns(x: Array, axis: int) -> Array:
         rows = x.reshape(*x.shape[:axis], size, x.shape[axis] // size, *x.shape[axis + 1 :])
         return jax.lax.dynamic_index_in_dim(rows, index, axis + 1, keepdims=False)
 
+    each = rollout.steps._replace(frames=())
     return Rollout(
-        steps=jax.tree.map(lambda x: columns(x, 1), rollout.steps),
+        steps=jax.tree.map(lambda x: columns(x, 1), each)._replace(frames=rollout.steps.frames),
         core_state=jax.tree.map(lambda x: columns(x, 0), rollout.core_state),
     )
 
@@ -210,12 +211,12 @@ def update(
     metrics are those of the whole, the same on every device.
     """
     part = minibatch(rollout, index, size)
-    frames_seen = part.steps.frame_std[:-1].size
-    averages = jnp.mean(part.steps.frame_mean[:-1], (0, 1)), jnp.mean(part.steps.frame_std[:-1], (0, 1))
+    frames_seen = part.steps.is_first[:-1].size
+    frame_mean, frame_std = (jnp.mean(x[:-1], (0, 1)) for x in part.steps.frames)
     results = jax.grad(loss, has_aux=True)(state.params, agent, part, axis=axis)
     if axis:
         shards = jax.lax.axis_size(axis)
-        results, averages = _whole((results, jax.tree.map(lambda x: x / shards, averages)), axis)
+        results, frame_mean, frame_std = _whole((results, frame_mean / shards, frame_std / shards), axis)
         frames_seen *= shards
     gradient, metrics = results
     metrics = _with_information(metrics)
@@ -228,7 +229,7 @@ def update(
     params = jax.tree.map(lambda new, old: jnp.where(finite, new, old), params, state.params)
     opt_state = opt_state._replace(count=state.opt_state.count + finite)
     most = agent.config.learner.max_grad_norm
-    statistics = frames.update_statistics(state.statistics, *averages, is_first_pass * frames_seen)
+    statistics = frames.update_statistics(state.statistics, frame_mean, frame_std, is_first_pass * frames_seen)
     skipped = jnp.where(finite, 0, state.skipped + 1)
     updates = state.updates + 1
     metrics |= {

@@ -24,6 +24,7 @@ class Programs(NamedTuple):
 
     act: Callable[..., tuple[Array, ActorState, Rollout]]
     update: Callable[..., tuple[TrainState, learner.Metrics]]
+    shards: int = 1  # devices of this process that share a rollout
 
 
 def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
@@ -44,6 +45,7 @@ def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
     return Programs(
         act=_on(layout.local, act, acting, (BATCH, BATCH, ROLLOUT), donate=3),
         update=_on(layout.job, update, updating, (EVERYWHERE, EVERYWHERE), donate=0),
+        shards=layout.local.size,
     )
 
 
@@ -78,8 +80,8 @@ def acting_keys(seed: int, group: int, first: int, batch: int) -> Key[Array, "B"
     return jax.vmap(functools.partial(jax.random.fold_in, key))(first + jnp.arange(batch))
 
 
-def empty_rollout(agent: Agent, batch: int, timestep: TimeStep) -> Rollout:
-    """The buffer that `act` writes to: T+1 rows of `batch` environments."""
+def empty_rollout(agent: Agent, batch: int, timestep: TimeStep, shards: int = 1) -> Rollout:
+    """The buffer that `act` writes to: T+1 rows of `batch` environments, spread over `shards` devices."""
     actor_state = agent.initial_state(batch)
     shapes = jax.eval_shape(
         lambda: agent.act(
@@ -91,8 +93,9 @@ def empty_rollout(agent: Agent, batch: int, timestep: TimeStep) -> Rollout:
         )[0]
     )
     rows = agent.config.learner.rollout_length + 1
+    steps = jax.tree.map(lambda s: jnp.zeros((rows, *s.shape), s.dtype), shapes)
     return Rollout(
-        steps=jax.tree.map(lambda s: jnp.zeros((rows, *s.shape), s.dtype), shapes),
+        steps=steps._replace(frames=tuple(jnp.repeat(x, shards, axis=1) for x in steps.frames)),
         core_state=jax.tree.map(jnp.zeros_like, actor_state.core_state),
     )
 

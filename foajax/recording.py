@@ -187,7 +187,7 @@ def _decide(
     frame = agent.frame(timestep.frame)[0]
     images = sense(frame, output.focal_point[0], sensor=packed(agent.config.sensor))
     levels = [jnp.round(255 * image[..., 0]).astype(jnp.uint8) for image in images]
-    return _Row(output._replace(roi=()), network, levels), frame, state
+    return _Row(output._replace(roi=(), frames=()), network, levels), frame, state
 
 
 def _in_colour(config: Config) -> bool:

@@ -63,7 +63,7 @@ class Collector:
                 Group(
                     timestep=timestep,
                     actor_state=agent.initial_state(batch),
-                    rollout=empty_rollout(agent, batch, timestep),
+                    rollout=empty_rollout(agent, batch, timestep, programs.shards),
                 )
             )
 

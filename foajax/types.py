@@ -67,8 +67,9 @@ class ActorOutput(NamedTuple):
     reward: Float[Array, "B"]  # of the time step acted on
     is_first: Bool[Array, "B"]
     is_terminal: Bool[Array, "B"]
-    frame_mean: Float[Array, "B *mean"]  # of the frame before normalisation, for the running statistics
-    frame_std: Float[Array, "B"]
+    # Mean and deviation of the frames before normalisation, for the running statistics: averages over the batch, or
+    # over each device's part of it.
+    frames: tuple[Float[Array, "1 ..."], ...]
 
 
 class Rollout(NamedTuple):

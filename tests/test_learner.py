@@ -178,8 +178,8 @@ def test_frames_are_counted_once_however_many_passes():
 def test_by_pixel_the_statistics_hold_the_mean_frame():
     loop = Loop("game=seek", *VIEW, "network.normalization=pixel")
     rollouts, _ = loop.collect()
-    seen = rollouts[0].steps.frame_mean[:-1]
-    assert seen.shape == (6, 8, 80, 80)
+    seen = rollouts[0].steps.frames[0][:-1]
+    assert seen.shape == (6, 1, 80, 80)
     state, _ = update_on(rollouts, loop.state, loop.programs, loop.config.learner)
     mean, _, weight = state.statistics
     np.testing.assert_allclose(mean / weight, seen.mean((0, 1)), atol=1e-3)

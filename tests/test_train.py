@@ -117,7 +117,11 @@ def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path):
     ("source", "word", "said"),
     [
         ("nowhere", "seed=1", "run=nowhere: does not exist"),
-        ("breakout", "network.lstm=8", "accepted is an agent with this run's sensor, network, gaze and number of actions"),
+        (
+            "breakout",
+            "network.lstm=8",
+            "accepted is an agent with this run's sensor, network, gaze and number of actions",
+        ),
     ],
 )
 def test_parameters_that_do_not_fit_are_refused_in_one_line(breakout, tmp_path, source, word, said):
