@@ -156,7 +156,7 @@ class NetworkConfig:
     torso: Literal["nature", "a3c"] = "nature"
     dense: int = 256  # units between torso and LSTM; 0 for none
     lstm: int = 256
-    normalization: Literal["running", "pixel", "frame", "none"] = "running"
+    normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 
     def __post_init__(self) -> None:
         _check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
@@ -185,7 +185,7 @@ class LearnerConfig:
     minibatches: int = 8  # groups of environments whose gradients are applied one after another
     epochs: int = 1  # passes over a rollout
     clip_ratio: float | None = None  # PPO's clipping of the probability ratio; null for plain A2C
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-3
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
     schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
     adam_b1: float = 0.9

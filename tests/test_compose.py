@@ -146,10 +146,8 @@ def test_learner_paper_is_table_three():
 
 
 def test_network_choices():
-    assert (
-        compose(["network=a3c"]).network
-        == compose(["network.torso=a3c", "network.dense=0", "network.lstm=512"]).network
-    )
+    words = ["network.torso=a3c", "network.dense=0", "network.lstm=512", "network.normalization=running"]
+    assert compose(["network=a3c"]).network == compose(words).network
     assert compose(["network=nature"]) == composed()
 
 
