@@ -186,6 +186,7 @@ class LearnerConfig:
     epochs: int = 1  # passes over a rollout
     clip_ratio: float | None = None  # PPO's clipping of the probability ratio; null for plain A2C
     learning_rate: float = 1e-3
+    full_rate_inputs: int | None = None  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
     schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
     adam_b1: float = 0.9
@@ -204,6 +205,8 @@ class LearnerConfig:
         for key, least, most in (("rollout_length", 2, 100_000), ("minibatches", 1, 100_000), ("epochs", 1, 1000)):
             value = getattr(self, key)
             _check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
+        inputs = self.full_rate_inputs
+        _check(inputs is None or inputs >= 1, "learner.full_rate_inputs", inputs, "null or an integer >= 1")
         _check(self.warmup_updates >= 0, "learner.warmup_updates", self.warmup_updates, "an integer >= 0")
         for key in ("learning_rate", "adam_eps"):
             _check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")

@@ -53,11 +53,18 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
         b2=learner.adam_b2,
         eps=learner.adam_eps,
         max_grad_norm=learner.max_grad_norm,
+        full_rate_inputs=learner.full_rate_inputs,
     )
 
 
 def amsgrad(
-    schedule: optax.Schedule, *, b1: float, b2: float, eps: float, max_grad_norm: float | None
+    schedule: optax.Schedule,
+    *,
+    b1: float,
+    b2: float,
+    eps: float,
+    max_grad_norm: float | None,
+    full_rate_inputs: int | None = None,
 ) -> optax.GradientTransformationExtraArgs:
     """AMSGrad (Reddi et al. 2018) in PyTorch's form.
 
@@ -69,12 +76,19 @@ def amsgrad(
         nu_max <- max(nu_max, nu)
         update  = -schedule(n - 1) / (1 - b1^n) * mu / (sqrt(nu_max) / sqrt(1 - b2^n) + eps)
 
+    With `full_rate_inputs`, the update of a layer's weights is multiplied by min(1, full_rate_inputs / inputs): a step
+    of one size in every weight moves a unit the further, the more inputs it has (Yang et al. 2022, table 3).
+
     `update` takes one argument more than optax's: with `accept=False` the gradient, whatever it holds, changes
     nothing and the update is 0.
 
     Clipping is part of it so that the factor joins the same loops over the parameters, which on the CPU are
     memory traffic and nothing else.
     """
+
+    def share(weights: Array) -> float:
+        inputs = math.prod(weights.shape[:-1]) if weights.ndim > 1 else 1
+        return 1.0 if full_rate_inputs is None else min(1.0, full_rate_inputs / inputs)
 
     def init(params: Params) -> AmsgradState:
         mu, nu, nu_max = (jax.tree.map(jnp.zeros_like, params) for _ in range(3))
@@ -97,7 +111,7 @@ def amsgrad(
         mu = _done(jax.tree.map(lambda m, g: keep1 * m + add1 * g, state.mu, grads))
         nu = _done(jax.tree.map(lambda v, g: keep2 * v + add2 * g * g, state.nu, grads))
         nu_max = _done(jax.tree.map(jnp.maximum, state.nu_max, nu))
-        updates = jax.tree.map(lambda m, v: -rate * m / (jnp.sqrt(v) / root + eps), mu, nu_max)
+        updates = jax.tree.map(lambda m, v: -rate * share(m) * m / (jnp.sqrt(v) / root + eps), mu, nu_max)
         return updates, AmsgradState(count=state.count + accept, mu=mu, nu=nu, nu_max=nu_max)
 
     return optax.GradientTransformationExtraArgs(init, update)

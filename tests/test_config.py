@@ -177,6 +177,7 @@ OUT_OF_RANGE = [
     ("learner.clip_ratio", 0.0),
     ("learner.learning_rate", 0.0),
     ("learner.learning_rate", float("nan")),
+    ("learner.full_rate_inputs", 0),
     ("learner.warmup_updates", -1),
     ("learner.schedule", "cosine"),
     ("learner.adam_b1", 1.0),

@@ -71,6 +71,14 @@ def test_every_update_is_pytorchs(eps, max_grad_norm, schedule):
     assert np.any(actual[150:]) == (schedule == "constant")
 
 
+@pytest.mark.parametrize(("most", "share"), [(2, 2 / 5), (5, 1.0), (64, 1.0)])
+def test_weights_with_many_inputs_move_in_inverse_proportion(most, share):
+    whole = np.array(list(run(PLAIN, UPDATES)))
+    scaled = np.array(list(run(dataclasses.replace(PLAIN, full_rate_inputs=most), UPDATES)))
+    expected = whole * np.repeat([1.0, share, 1.0], [3, 15, 1])  # bias, kernel, scale
+    np.testing.assert_allclose(scaled, expected, rtol=1e-6)
+
+
 def test_other_decay_rates_and_no_jit():
     learner = dataclasses.replace(PLAIN, adam_b1=0.0, adam_b2=0.9, adam_eps=1e-3, max_grad_norm=0.05)
     actual = list(run(learner, 150, compiled=lambda f: f))
