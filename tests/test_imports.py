@@ -41,6 +41,7 @@ WORLD = {
     "checkpoint",
     "cli",
     "compose",
+    "coordinator",
     "display",
     "distributed",
     "durable",
