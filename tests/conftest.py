@@ -26,14 +26,13 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="session")
 def untrained():
     """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
-    from foajax.frames import initial_statistics
     from foajax.store import Stored
 
     def make(agent, env_steps=0):
         random = np.random.default_rng(0)
         shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
         params = jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
-        return Stored(agent, params, initial_statistics(), env_steps)
+        return Stored(agent, params, agent.initial_statistics(), env_steps)
 
     return make
 
