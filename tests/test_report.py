@@ -37,7 +37,7 @@ def runs(tmp_path):
         words = ["game=seek", f"seed={seed}"]
         plain = [*words, "experiment=constant50_sub2_packed"]
         make_run(tmp_path, f"plain-{seed}", words=plain, scores=[0.0, 1.0 + seed, 2.0 + 2 * seed])
-        periphery = [*words, "experiment=constant70_p_packed", "learner.learning_rate=1e-3"]
+        periphery = [*words, "experiment=constant70_p_packed", "learner.learning_rate=2e-3"]
         make_run(tmp_path, f"periphery-{seed}", words=periphery, scores=[1.0, 5.0, 6.0 + seed])
     (tmp_path / "plain-0" / "score.json").write_text(json.dumps({"mean": 11.0, "episodes": 30}))
     return sorted(tmp_path.iterdir())
@@ -111,7 +111,7 @@ def test_the_page(runs, tmp_path, capsys, monkeypatch):
     assert page.count('src="data:image/') == 3
     assert '<a href="../periphery-0/render/episode-0.mp4">' in page
     assert "<td>constant50_sub2_packed</td>" in page and "7.5 [4, 11]" in page
-    assert "<td><code>learner.learning_rate</code></td><td>0.001</td><td>0.0003</td>" in page
+    assert "<td><code>learner.learning_rate</code></td><td>0.002</td><td>0.001</td>" in page
     assert re.search(r"<td class=\"number\">625</td><td class=\"number\">10 %</td>", page)
 
 
@@ -125,7 +125,7 @@ def test_the_page_is_whole_in_a_browser(runs, tmp_path):
 
 def test_runs_that_differ_need_names_that_differ(tmp_path):
     one = make_run(tmp_path, "a", words=["game=seek"], scores=[1.0])
-    two = make_run(tmp_path, "b", words=["game=seek", "seed=1", "learner.learning_rate=1e-3"], scores=[1.0])
+    two = make_run(tmp_path, "b", words=["game=seek", "seed=1", "learner.learning_rate=2e-3"], scores=[1.0])
     with pytest.raises(report.ConfigError, match="differs in learner.learning_rate from that of"):
         report.games_of(map(curves.read_run, (one, two)), None)
 

@@ -111,7 +111,7 @@ def test_a_failure_is_listed_in_the_end_and_the_others_run(make, capfd):
 def test_a_run_of_another_meaning_is_not_taken_for_finished(make, tmp_path):
     run = make("a", "finish")
     sweep.run_all([run], jobs=1, command=COMMAND)
-    other = compose([f"run={tmp_path / 'a'}", "train.env_steps=100", "game=seek", "learner.learning_rate=1e-3"])
+    other = compose([f"run={tmp_path / 'a'}", "train.env_steps=100", "game=seek", "learner.learning_rate=1e-4"])
     assert not sweep.skip_if_finished(other) and sweep.skip_if_finished(run.config)
 
 
