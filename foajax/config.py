@@ -186,7 +186,7 @@ class LearnerConfig:
     epochs: int = 1  # passes over a rollout
     clip_ratio: float | None = None  # PPO's clipping of the probability ratio; null for plain A2C
     learning_rate: float = 1e-3
-    full_rate_inputs: int | None = None  # layers with more inputs have a rate that much smaller; null for none
+    full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
     schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
     adam_b1: float = 0.9
