@@ -92,7 +92,7 @@ def free_address() -> str:
 def training(options: Options, run: Path, processes: int, process: int, address: str) -> list[str]:
     """The words of one process of a run: equal work for each process, whatever their number."""
     words = [f"game={options.game}", f"experiment={options.experiment}", f"run={run}", "env.threads=1"]
-    words += [f"env.num_envs={options.envs * processes}", "learner.minibatches=4", "train.log_every=0.5"]
+    words += [f"env.num_envs={options.envs * processes}", "learner=a2c", "learner.minibatches=4", "train.log_every=0.5"]
     words += ["train.env_steps=100000000", "train.checkpoint_every=1000"]
     if processes > 1:
         shared = {"coordinator": address, "processes": processes, "process": process}

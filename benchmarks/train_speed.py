@@ -1,6 +1,6 @@
 """How fast does training run, against the emulator alone?
 
-    python benchmarks/train_speed.py [experiments=constant70_packed,nonfoa] [torso=a3c] [num_envs=32] [out=<file>] ...
+    python benchmarks/train_speed.py [experiments=constant70_packed,nonfoa] [torso=a3c] [learner=default] [out=<file>]
 
 For each experiment, in a process of its own: the environments alone under random actions, `act` alone, `update`
 alone, and the training loop, in turns of a few seconds, `repeats` times over. Printed and written are medians of
@@ -51,6 +51,7 @@ class Options:
 
     experiments: str = "nonfoa,constant70,constant70_packed,constant70_p_packed,decreasing_packed,logpolar"
     torso: str = "nature"  # of the group network/
+    learner: str = "a2c"  # one pass over each step, as the codes that speeds are compared with
     num_envs: int = 32
     repeats: int = 5
     seconds: float = 3.0  # a turn of one part
@@ -145,6 +146,7 @@ def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
     record: dict[str, Any] = {
         "experiment": config.name,
         "torso": config.network.torso,
+        "learner": options.learner,
         "num_envs": config.env.num_envs,
         "groups": config.env.groups,
     }
@@ -193,7 +195,8 @@ def main(arguments: Sequence[str]) -> None:
     print("  ".join(f"{key} {value}" for key, value in device.items()), flush=True)
     records = []
     for name in options.experiments.split(","):
-        words = [f"experiment={name}", f"network={options.torso}", f"env.num_envs={options.num_envs}", *more]
+        groups = [f"experiment={name}", f"network={options.torso}", f"learner={options.learner}"]
+        words = [*groups, f"env.num_envs={options.num_envs}", *more]
         config = compose(words)
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             record = pool.apply(measure, (words, options))

@@ -131,7 +131,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
     """One experiment on both sides."""
     import torch
 
-    config = compose([f"experiment={name}", f"network={options.torso}"])
+    config = compose([f"experiment={name}", f"network={options.torso}", "learner=a2c"])
     agent = Agent(config, ACTIONS, None)
     params = agent.initial_params(jax.random.key(0))
     random = np.random.default_rng(0)

@@ -168,7 +168,7 @@ class HeadConfig:
     """What one head learns with."""
 
     gamma: float = 0.99
-    gae_lambda: float = 0.92
+    gae_lambda: float = 0.95
     beta: float = 0.01  # weight of the entropy
 
     def __post_init__(self) -> None:
@@ -181,10 +181,10 @@ class HeadConfig:
 class LearnerConfig:
     """The update."""
 
-    rollout_length: int = 20  # T
-    minibatches: int = 8  # groups of environments whose gradients are applied one after another
-    epochs: int = 1  # passes over a rollout
-    clip_ratio: float | None = None  # PPO's clipping of the probability ratio; null for plain A2C
+    rollout_length: int = 64  # T
+    minibatches: int = 16  # groups of environments whose gradients are applied one after another
+    epochs: int = 2  # passes over a rollout
+    clip_ratio: float | None = 0.1  # PPO's clipping of the probability ratio; null for plain A2C
     learning_rate: float = 1e-3
     full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
@@ -194,7 +194,7 @@ class LearnerConfig:
     adam_eps: float = 1e-5
     max_grad_norm: float | None = 0.5  # of the whole gradient; null for no clipping
     reduction: Literal["mean", "sum"] = "mean"  # of the losses over time; over environments always the mean
-    normalize_advantages: bool = False
+    normalize_advantages: bool = True
     value_weight: float = 0.5
     vision_weight: float = 1.0  # of both of the vision head's losses
     vision_bootstrap: Literal["consistent", "literal"] = "consistent"

@@ -206,6 +206,7 @@ class Run:
             self._dump.look(metrics)
         last, most = metrics[-1], self._config.train.max_skipped
         if int(last["skipped_in_a_row"]) >= most:
+            self._log(metrics)
             values = ", ".join(f"{name} {float(last[name]):.4g}" for name in ("loss", "grad_norm", "param_norm"))
             raise ConfigError(
                 f"train.max_skipped={most}: so many updates in a row were not finite ({values}); the last good "

@@ -90,7 +90,10 @@ def main(arguments: Sequence[str]) -> None:
     runs = sorted((read_run(path) for path in KEPT.iterdir() if path.is_dir()), key=lambda run: run.config.game)
     head = ["game", "experiment", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     lines = [head, ["---"] * len(head), *map(row, runs)]
-    intro = "Score: mean and standard error over whole games, unclipped, sampled policy. Made by `results/keep.py`."
+    intro = (
+        "Score: mean and standard error over whole games, unclipped, sampled policy. Each `run.json` has the command, "
+        "with\nthe commit whose defaults it is meant for, and the machine. Made by `results/keep.py`."
+    )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     (KEPT / "README.md").write_text(f"# Finished runs\n{intro}\n\n{table}\n")
     for game, groups in games_of(runs, None).items():

@@ -145,6 +145,13 @@ def test_learner_paper_is_table_three():
     assert env.clip_rewards and env.episodic_life and env.fire_on_reset
 
 
+def test_learner_a2c_is_one_pass_without_clipping():
+    learner = compose(["learner=a2c", "learner.minibatches=4"]).learner
+    assert (learner.rollout_length, learner.minibatches, learner.epochs) == (20, 4, 1)
+    assert learner.clip_ratio is None and not learner.normalize_advantages
+    assert learner.natural == learner.vision == HeadConfig(gae_lambda=0.92, beta=0.003)
+
+
 def test_network_choices():
     words = ["network.torso=a3c", "network.dense=0", "network.lstm=512", "network.normalization=running"]
     assert compose(["network=a3c"]).network == compose(words).network

@@ -230,7 +230,7 @@ def test_a_log_polar_value_out_of_range_is_refused_by_name(key, value):
         ("env.noop_max", 0),
         ("network.dense", 0),
         ("learner.minibatches", 32),
-        ("train.env_steps", 640 * (2**31 // 20 - 2)),  # rollouts of 20 steps, counted in 32 bits
+        ("train.env_steps", 2048 * (2**31 // 64 - 2)),  # rollouts of 64 steps, counted in 32 bits
         ("learner.clip_ratio", 0.2),
         ("learner.max_grad_norm", None),
         ("learner.natural.gamma", 1),

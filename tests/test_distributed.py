@@ -255,7 +255,7 @@ def test_a_directory_that_cannot_be_used_ends_all_in_one_line(tmp_path):
 
 
 def test_devices_have_to_share_a_minibatch_evenly():
-    with pytest.raises(ConfigError, match=r"train.devices=3: accepted is a divisor of the 4 environments of a minib"):
+    with pytest.raises(ConfigError, match=r"train.devices=3: accepted is a divisor of the 2 environments of a minib"):
         compose(["train.devices=3"])
 
 

@@ -44,8 +44,8 @@ def test_a_run_leaves_everything_that_it_promises(breakout):
     assert json.loads((run / "run.json").read_text())["starts"][0]["packages"]["envpool"]
 
 
-def test_the_same_seed_gives_the_same_fifty_updates_on_the_emulators_too(breakout, tmp_path):
-    """Two minibatches of 40 steps a rollout; the engine's threads, which are as many as it likes, do not matter."""
+def test_the_same_seed_gives_the_same_hundred_updates_on_the_emulators_too(breakout, tmp_path):
+    """Two minibatches, twice, of 40 steps a rollout; the engine may use as many threads as it likes."""
     run, _ = breakout
     words = ["experiment=constant50_sub2_packed", *TINY, f"run={tmp_path}", "train.env_steps=1000", "env.threads=1"]
     code, out, err = finish(*words)
@@ -76,7 +76,7 @@ def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(brea
     template = jax.eval_shape(lambda: state)
     saved = Checkpoints(path / "checkpoints", keep=None).restore({"train": template, "collector": []})
     jax.tree.map(np.testing.assert_array_equal, state, saved.state["train"])  # optimiser and counters too
-    assert state.updates == env_steps / 40 * 2 and state.opt_state.count == state.updates
+    assert state.updates == env_steps / 40 * 2 * 2 and state.opt_state.count == state.updates
     assert env_steps == saved.env_steps == rows(path)[-1]["env_steps"] >= 1000
     assert tracker == saved.meta["tracker"] | {name: [0] * 8 for name in ("scores", "lengths")}
 
