@@ -192,8 +192,11 @@ def test_information_is_what_decisions_tell_of_what_was_seen(seek):
 
     def information(scale):
         state = jax.tree.map(jnp.copy, seek.state)
-        for head in ("natural", "vision"):
+        seen = seek.agent.unroll(state.params, learner.minibatch(rollout, jnp.int32(0), 4))
+        for head, logits in (("natural", seen.natural_logits), ("vision", seen.vision_logits)):
             weights = state.params["params"][f"{head}_policy"]
+            # About their mean, so that which action is the likeliest does depend on what is seen.
+            weights["bias"] = scale * (weights["bias"] - logits.mean((0, 1)))
             weights["kernel"] = weights["kernel"] * scale
         metrics = seek.programs.update(state, rollout, np.int32(0), np.bool_(True))[1]
         return [metrics[f"{head}_information"] for head in ("natural", "vision")], metrics
