@@ -197,6 +197,7 @@ class LearnerConfig:
     normalize_advantages: bool = True
     value_weight: float = 0.5
     vision_weight: float = 1.0  # of both of the vision head's losses
+    value_target: Literal["n_step", "lambda"] = "n_step"  # to the rollout's end, or mixed as the advantages are
     vision_bootstrap: Literal["consistent", "literal"] = "consistent"
     natural: HeadConfig = HeadConfig()
     vision: HeadConfig = HeadConfig()

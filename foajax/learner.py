@@ -68,7 +68,7 @@ def loss(
     mask_t = 1.0 - steps.is_first[1:].astype(jnp.float32)  # the step after an episode's end is nobody's
     transitions = (steps.reward[1:], is_terminal_t, mask_t)
 
-    heads = [_natural_targets(config.natural, *transitions, output.natural_value)]
+    heads = [_natural_targets(config, *transitions, output.natural_value)]
     if output.vision_value is not None:
         heads.append(_vision_targets(config, *transitions, output.vision_value))
     valid = _whole(jnp.stack([losses.valid_steps(targets.mask_t) for targets in heads]), axis)
@@ -109,14 +109,15 @@ class Targets(NamedTuple):
     mask_t: Float[Array, "T B"]  # 1 where the step enters the loss
 
 
-def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
+def _natural_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
+    head = config.natural
+
     def one(r_t, is_terminal_t, mask_t, v):
         discount_t = head.gamma * (1.0 - is_terminal_t)
-        return Targets(
-            returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
-            advantages=returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda),
-            mask_t=mask_t,
-        )
+        advantages = returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda)
+        n_step = returns.n_step_returns(r_t, discount_t, mask_t, v[1:])
+        target = n_step if config.value_target == "n_step" else v[:-1] + advantages
+        return Targets(returns=target, advantages=advantages, mask_t=mask_t)
 
     return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
 
@@ -126,11 +127,11 @@ def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mas
 
     def one(r_t, is_terminal_t, mask_t, v):
         stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
-        return Targets(
-            returns=returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap),
-            advantages=returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda),
-            mask_t=returns.vision_stream(r_t, is_terminal_t, mask_t).loss_mask_t,
-        )
+        advantages = returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda)
+        n_step = returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap)
+        target = n_step if config.value_target == "n_step" else v[:-1] + advantages
+        mask_t = returns.vision_stream(r_t, is_terminal_t, mask_t).loss_mask_t
+        return Targets(returns=target, advantages=advantages, mask_t=mask_t)
 
     return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
 
