@@ -189,6 +189,7 @@ class LearnerConfig:
     full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
     schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
+    amsgrad: bool = True  # divide by the largest second moment so far; False for plain Adam
     adam_b1: float = 0.9
     adam_b2: float = 0.999
     adam_eps: float = 1e-5

@@ -54,6 +54,7 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
         eps=learner.adam_eps,
         max_grad_norm=learner.max_grad_norm,
         full_rate_inputs=learner.full_rate_inputs,
+        largest=learner.amsgrad,
     )
 
 
@@ -65,6 +66,7 @@ def amsgrad(
     eps: float,
     max_grad_norm: float | None,
     full_rate_inputs: int | None = None,
+    largest: bool = True,
 ) -> optax.GradientTransformationExtraArgs:
     """AMSGrad (Reddi et al. 2018) in PyTorch's form.
 
@@ -78,6 +80,8 @@ def amsgrad(
 
     With `full_rate_inputs`, the update of a layer's weights is multiplied by min(1, full_rate_inputs / inputs): a step
     of one size in every weight moves a unit the further, the more inputs it has (Yang et al. 2022, table 3).
+
+    Without `largest`, nu_max is nu: Adam (Kingma & Ba 2015).
 
     `update` takes one argument more than optax's: with `accept=False` the gradient, whatever it holds, changes
     nothing and the update is 0.
@@ -110,7 +114,7 @@ def amsgrad(
         # The barriers keep XLA from computing a moment twice, which would cost a copy of its old value.
         mu = _done(jax.tree.map(lambda m, g: keep1 * m + add1 * g, state.mu, grads))
         nu = _done(jax.tree.map(lambda v, g: keep2 * v + add2 * g * g, state.nu, grads))
-        nu_max = _done(jax.tree.map(jnp.maximum, state.nu_max, nu))
+        nu_max = _done(jax.tree.map(jnp.maximum, state.nu_max, nu)) if largest else nu
         updates = jax.tree.map(lambda m, v: -rate * share(m) * m / (jnp.sqrt(v) / root + eps), mu, nu_max)
         return updates, AmsgradState(count=state.count + accept, mu=mu, nu=nu, nu_max=nu_max)
 
