@@ -1,4 +1,4 @@
-"""AMSGrad as PyTorch's `torch.optim.Adam(amsgrad=True)` defines it, with clipping and a schedule.
+"""Adam and AMSGrad as PyTorch's `torch.optim.Adam` defines them, with clipping and a schedule.
 
 Why not `optax.amsgrad`: it takes the maximum of the bias-corrected second moment, PyTorch corrects after the
 maximum; and no choice of its options scales eps as PyTorch does. The paper's shared Adam exists in
@@ -19,17 +19,17 @@ from foajax.config import ConfigError, LearnerConfig
 from foajax.types import Params
 
 
-class AmsgradState(NamedTuple):
+class AdamState(NamedTuple):
     """What the optimiser remembers: the same tree for every configuration."""
 
     count: Int[Array, ""]  # type: ignore[assignment]  # updates made; hides tuple.count
     mu: Params  # moving average of the gradient
     nu: Params  # moving average of its square
-    nu_max: Params  # largest nu so far, element by element, before bias correction
+    nu_max: Params  # largest nu so far, element by element, before bias correction; stays 0 for Adam
 
 
 def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.GradientTransformationExtraArgs:
-    """The optimiser of a run: clipping by global norm, AMSGrad, learning rate.
+    """The optimiser of a run: clipping by global norm, Adam or AMSGrad, learning rate.
 
     The rate of update n = 1, 2, .. is `learning_rate`, times min(1, n / warmup_updates), times
     max(0, 1 - (n - 1) / total_updates) where `schedule` is `linear`. Raises `ConfigError` where `total_updates` is
@@ -47,18 +47,18 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
             rate *= jnp.maximum(total_updates - count, 0) / total_updates
         return rate
 
-    return amsgrad(
+    return adam(
         schedule,
         b1=learner.adam_b1,
         b2=learner.adam_b2,
         eps=learner.adam_eps,
         max_grad_norm=learner.max_grad_norm,
         full_rate_inputs=learner.full_rate_inputs,
-        largest=learner.amsgrad,
+        amsgrad=learner.amsgrad,
     )
 
 
-def amsgrad(
+def adam(
     schedule: optax.Schedule,
     *,
     b1: float,
@@ -66,9 +66,9 @@ def amsgrad(
     eps: float,
     max_grad_norm: float | None,
     full_rate_inputs: int | None = None,
-    largest: bool = True,
+    amsgrad: bool = True,
 ) -> optax.GradientTransformationExtraArgs:
-    """AMSGrad (Reddi et al. 2018) in PyTorch's form.
+    """AMSGrad (Reddi et al. 2018) in PyTorch's form; without `amsgrad`, Adam (Kingma & Ba 2015).
 
     For update n = 1, 2, .. and gradient g, element by element:
 
@@ -78,10 +78,10 @@ def amsgrad(
         nu_max <- max(nu_max, nu)
         update  = -schedule(n - 1) / (1 - b1^n) * mu / (sqrt(nu_max) / sqrt(1 - b2^n) + eps)
 
+    Adam has nu in the place of nu_max.
+
     With `full_rate_inputs`, the update of a layer's weights is multiplied by min(1, full_rate_inputs / inputs): a step
     of one size in every weight moves a unit the further, the more inputs it has (Yang et al. 2022, table 3).
-
-    Without `largest`, nu_max is nu: Adam (Kingma & Ba 2015).
 
     `update` takes one argument more than optax's: with `accept=False` the gradient, whatever it holds, changes
     nothing and the update is 0.
@@ -94,13 +94,13 @@ def amsgrad(
         inputs = math.prod(weights.shape[:-1]) if weights.ndim > 1 else 1
         return 1.0 if full_rate_inputs is None else min(1.0, full_rate_inputs / inputs)
 
-    def init(params: Params) -> AmsgradState:
+    def init(params: Params) -> AdamState:
         mu, nu, nu_max = (jax.tree.map(jnp.zeros_like, params) for _ in range(3))
-        return AmsgradState(count=jnp.zeros((), jnp.int32), mu=mu, nu=nu, nu_max=nu_max)
+        return AdamState(count=jnp.zeros((), jnp.int32), mu=mu, nu=nu, nu_max=nu_max)
 
     def update(
-        grads: Params, state: AmsgradState, params: Params | None = None, *, accept: Bool[Array, ""] | bool = True
-    ) -> tuple[Params, AmsgradState]:
+        grads: Params, state: AdamState, params: Params | None = None, *, accept: Bool[Array, ""] | bool = True
+    ) -> tuple[Params, AdamState]:
         del params
         most = jnp.inf if max_grad_norm is None else max_grad_norm
         norm = optax.tree.norm(grads)
@@ -114,9 +114,10 @@ def amsgrad(
         # The barriers keep XLA from computing a moment twice, which would cost a copy of its old value.
         mu = _done(jax.tree.map(lambda m, g: keep1 * m + add1 * g, state.mu, grads))
         nu = _done(jax.tree.map(lambda v, g: keep2 * v + add2 * g * g, state.nu, grads))
-        nu_max = _done(jax.tree.map(jnp.maximum, state.nu_max, nu)) if largest else nu
-        updates = jax.tree.map(lambda m, v: -rate * share(m) * m / (jnp.sqrt(v) / root + eps), mu, nu_max)
-        return updates, AmsgradState(count=state.count + accept, mu=mu, nu=nu, nu_max=nu_max)
+        nu_max = _done(jax.tree.map(jnp.maximum, state.nu_max, nu)) if amsgrad else state.nu_max
+        second = nu_max if amsgrad else nu
+        updates = jax.tree.map(lambda m, v: -rate * share(m) * m / (jnp.sqrt(v) / root + eps), mu, second)
+        return updates, AdamState(count=state.count + accept, mu=mu, nu=nu, nu_max=nu_max)
 
     return optax.GradientTransformationExtraArgs(init, update)
 

@@ -85,6 +85,24 @@ def test_the_loss_is_the_sum_of_its_weighted_terms(seek):
     np.testing.assert_allclose(total, expected, rtol=1e-5)
 
 
+def test_values_learn_from_lambda_returns(seek):
+    """They are the n-step returns where lambda is 1, and rewards with the next value where it is 0."""
+    (rollout,), _ = seek.collect()
+
+    def value_losses(target, gae_lambda):
+        words = [f"learner.value_target={target}", f"learner.natural.gae_lambda={gae_lambda}"]
+        config = compose.compose([*SMALL, "game=seek", "experiment=constant50_sub2_packed", *words])
+        agent = Agent(config, seek.agent.num_actions, seek.agent.crop_top)
+        _, metrics = jax.jit(lambda params: learner.loss(params, agent, rollout))(seek.state.params)
+        return metrics["natural_value_loss"], metrics["vision_value_loss"]
+
+    np.testing.assert_allclose(value_losses("lambda", 1.0), value_losses("n_step", 1.0), rtol=1e-5)
+    steps, value = rollout.steps, seek.agent.unroll(seek.state.params, rollout).natural_value
+    error = steps.reward[1:] + seek.config.learner.natural.gamma * ~steps.is_terminal[1:] * value[1:] - value[:-1]
+    expected = 0.5 * np.mean(np.square(error), where=~np.asarray(steps.is_first[1:]))
+    np.testing.assert_allclose(value_losses("lambda", 0.0)[0], expected, rtol=1e-5)
+
+
 def test_the_last_row_is_only_bootstrapped_from(seek):
     """Changing what the last row chose, or its vision value's target, changes nothing but the bootstrap."""
     (rollout,), _ = seek.collect()

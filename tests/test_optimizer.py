@@ -1,4 +1,4 @@
-"""AMSGrad against PyTorch's rule in NumPy (and PyTorch itself where it is installed)."""
+"""Adam and AMSGrad against PyTorch's rule in NumPy (and PyTorch itself where it is installed)."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ def gradients():
 
 
 def pytorch_rule(learner, total_updates):
-    """Yields each update of `torch.optim.Adam(amsgrad=True)` after clipping by global norm, in float64."""
+    """Yields each update of `torch.optim.Adam(amsgrad=learner.amsgrad)` after clipping by global norm, in float64."""
     b1, b2 = learner.adam_b1, learner.adam_b2
     m = v = v_max = None
     for step, tree in enumerate(gradients(), start=1):
@@ -44,7 +44,7 @@ def pytorch_rule(learner, total_updates):
             lr *= max(0.0, 1 - (step - 1) / total_updates)
         m = b1 * m + (1 - b1) * g
         v = b2 * v + (1 - b2) * g * g
-        v_max = np.maximum(v_max, v)
+        v_max = np.maximum(v_max, v) if learner.amsgrad else v
         denominator = np.sqrt(v_max) / np.sqrt(1 - b2**step) + learner.adam_eps
         yield -lr / (1 - b1**step) * m / denominator
 
@@ -60,11 +60,12 @@ def run(learner, total_updates, compiled=jax.jit):
         yield np.concatenate([np.ravel(u) for u in jax.tree.leaves(updates)])
 
 
+@pytest.mark.parametrize("amsgrad", [True, False])
 @pytest.mark.parametrize("eps", [1e-8, 1e-3])
 @pytest.mark.parametrize("max_grad_norm", [None, 0.05])
 @pytest.mark.parametrize("schedule", ["constant", "linear"])
-def test_every_update_is_pytorchs(eps, max_grad_norm, schedule):
-    learner = dataclasses.replace(PLAIN, adam_eps=eps, max_grad_norm=max_grad_norm, schedule=schedule)
+def test_every_update_is_pytorchs(amsgrad, eps, max_grad_norm, schedule):
+    learner = dataclasses.replace(PLAIN, amsgrad=amsgrad, adam_eps=eps, max_grad_norm=max_grad_norm, schedule=schedule)
     actual, expected = list(run(learner, 150)), list(pytorch_rule(learner, 150))
     assert len(actual) == UPDATES
     np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * learner.learning_rate)
@@ -86,13 +87,15 @@ def test_other_decay_rates_and_no_jit():
     np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * learner.learning_rate)
 
 
+@pytest.mark.parametrize("amsgrad", [True, False])
 @pytest.mark.parametrize("eps", [1e-8, 1e-3])
-def test_against_pytorch(eps):
+def test_against_pytorch(amsgrad, eps):
     torch = pytest.importorskip("torch")
     param = torch.nn.Parameter(torch.zeros(19))
-    optimizer = torch.optim.Adam([param], lr=PLAIN.learning_rate, eps=eps, amsgrad=True)
+    optimizer = torch.optim.Adam([param], lr=PLAIN.learning_rate, eps=eps, amsgrad=amsgrad)
     total = np.zeros(19)
-    for update, grads in zip(run(dataclasses.replace(PLAIN, adam_eps=eps), 1), gradients(), strict=True):
+    learner = dataclasses.replace(PLAIN, adam_eps=eps, amsgrad=amsgrad)
+    for update, grads in zip(run(learner, 1), gradients(), strict=True):
         param.grad = torch.tensor(np.concatenate([np.ravel(g) for g in jax.tree.leaves(grads)]))
         optimizer.step()
         total += update
