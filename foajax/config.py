@@ -169,7 +169,7 @@ class HeadConfig:
 
     gamma: float = 0.99
     gae_lambda: float = 0.95
-    beta: float = 0.01  # weight of the entropy
+    beta: float = 0.003  # weight of the entropy
 
     def __post_init__(self) -> None:
         _check(0 <= self.gamma <= 1, "gamma", self.gamma, "a number in [0, 1]")
@@ -189,7 +189,7 @@ class LearnerConfig:
     full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
     schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
-    amsgrad: bool = True  # divide by the largest second moment so far; False for plain Adam
+    amsgrad: bool = False  # divide by the largest second moment so far, in place of Adam's latest
     adam_b1: float = 0.9
     adam_b2: float = 0.999
     adam_eps: float = 1e-5
@@ -197,8 +197,8 @@ class LearnerConfig:
     reduction: Literal["mean", "sum"] = "mean"  # of the losses over time; over environments always the mean
     normalize_advantages: bool = True
     value_weight: float = 0.5
-    vision_weight: float = 1.0  # of both of the vision head's losses
-    value_target: Literal["n_step", "lambda"] = "n_step"  # to the rollout's end, or mixed as the advantages are
+    vision_weight: float = 0.25  # of both of the vision head's losses
+    value_target: Literal["n_step", "lambda"] = "lambda"  # to the rollout's end, or mixed as the advantages are
     vision_bootstrap: Literal["consistent", "literal"] = "consistent"
     natural: HeadConfig = HeadConfig()
     vision: HeadConfig = HeadConfig()

@@ -139,6 +139,7 @@ def test_learner_paper_is_table_three():
     assert (learner.adam_b1, learner.adam_b2, learner.adam_eps) == (0.9, 0.999, 1e-8)
     assert (learner.max_grad_norm, learner.clip_ratio, learner.reduction) == (None, None, "sum")
     assert (learner.value_weight, learner.vision_weight, learner.epochs) == (1.0, 1.0, 1)
+    assert learner.amsgrad and learner.value_target == "n_step"
     assert learner.minibatches == 32
     assert compose(["learner=paper", "env.num_envs=6"]).learner.minibatches == 6
     assert env.frame_shape == (80, 80) and env.frame_skip == 4 and env.noop_max == 30
