@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from foajax import cost
 from foajax.config import LogPolarSensor, RingSensor, Sensor
 from foajax.foveation import sense
 
@@ -69,7 +70,7 @@ def batch(size: int, shape: tuple[int, int] = (80, 80)) -> tuple[np.ndarray, np.
 
 def sensing(sensor: Sensor, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
     """A compiled call on arrays in the device's memory; vmapped where there is a batch."""
-    run = functools.partial(sense, sensor=sensor)
+    run = functools.partial(sense, sensor=sensor, bounds="window")
     compiled = jax.jit(jax.vmap(run) if frames.ndim == 3 else run)
     return functools.partial(compiled, jnp.asarray(frames), jnp.asarray(points))
 
@@ -126,6 +127,7 @@ def main(arguments: list[str]) -> None:
     options = dict(argument.partition("=")[::2] for argument in arguments)
     if set(options) - {"out"}:
         sys.exit(f"benchmarks/foveation.py: {' '.join(arguments)}: accepted is out=<file>")
+    cost.wait_in_place()
     results: dict[str, object] = {
         "device": jax.devices()[0].device_kind,
         "cpus": os.cpu_count(),

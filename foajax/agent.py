@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, cast
 
 import jax
@@ -150,7 +151,8 @@ class Agent:
 
     def sense(self, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
         """The sensor's images of each frame, [B, h, w, 1]."""
-        return jax.vmap(lambda f, p: sense(f, p, sensor=self.config.sensor))(frame, focal_point)
+        look = functools.partial(sense, sensor=self.config.sensor, bounds=self.config.gaze.bounds)
+        return jax.vmap(look)(frame, focal_point)
 
     def unit(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
         """Focal points in [-1, 1]."""

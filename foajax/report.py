@@ -307,6 +307,7 @@ def report(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, [word for word in arguments if "=" in word])
     if not paths:
         raise ConfigError("no runs: accepted is report runs/<a> runs/<b> ... out=report")
+    cost.wait_in_place()
     games = games_of(map(read_run, dict.fromkeys(paths)), options.preset)
     print(build(games, find_maps(games, options.episodes), options))
 

@@ -204,7 +204,7 @@ class _Eye:
         where: dict[str, Any] = {"gaze": self.gaze, "window": self.sensor.window, "frame_shape": shape}
         start = gazes.start(jax.random.key(seed), **where)
         focal_point = jnp.where(is_first, start, gazes.move(focal_point, vision_action, **where))
-        images = sense(frame, focal_point, sensor=self.sensor)
+        images = sense(frame, focal_point, sensor=self.sensor, bounds=self.gaze.bounds)
         # A mean may round to just outside the range, and then would not be of the observation space.
         named = self.named([jnp.clip(image * self.scale, *self.range) for image in images])
         return {**named, "focal_point": gazes.to_unit(focal_point, shape)}, focal_point

@@ -109,6 +109,25 @@ def test_table_ii_sensors_match_the_oracle(name):
             np.testing.assert_allclose(image[index, ..., 0], wanted, atol=0 if sensor.pooling == "stride" else 1e-5)
 
 
+@pytest.mark.parametrize("name", [*SENSORS, "logpolar"])
+def test_within_bounds_an_area_that_would_overhang_is_moved_inside(name):
+    sensor = LogPolarSensor(rings=6, wedges=8, radius=20.0) if name == "logpolar" else SENSORS[name]
+    frames = jnp.asarray(random_frames((len(POINTS), 80, 80)))
+    low = np.array(sensor.window) // 2
+    moved = np.clip(POINTS, low, 80 - np.array(sensor.window) + low)
+    assert not np.array_equal(moved, POINTS)
+    inside = jax.jit(jax.vmap(functools.partial(sense, sensor=sensor, bounds="window")))
+    for image, wanted in zip(
+        inside(frames, jnp.asarray(POINTS)), batched(sensor)(frames, jnp.asarray(moved)), strict=True
+    ):
+        np.testing.assert_allclose(image, wanted, atol=1e-6)
+
+
+def test_bounds_that_an_area_cannot_keep_are_refused():
+    with pytest.raises(ConfigError, match=r"bounds=window: accepted is 'point' where .* \(9, 4\) exceeds \(8, 8\)"):
+        sense(jnp.zeros((8, 8)), jnp.array([4, 4]), sensor=RingSensor(((9, 4, 1),)), bounds="window")
+
+
 def test_the_convention_by_hand():
     frame = jnp.arange(80 * 80, dtype=jnp.float32).reshape(80, 80)
     see = jax.jit(sense, static_argnames="sensor")
@@ -266,8 +285,9 @@ def test_the_cost_does_not_grow_with_the_frame(layout):
     sensor = RingSensor(DECREASING, layout=layout)
     for shape in [(1080, 1920), (1080, 1920, 3)]:
         frame, point = jnp.zeros(shape, jnp.uint8), jnp.zeros(2, jnp.int32)
-        compiled = jax.jit(functools.partial(sense, sensor=sensor)).lower(frame, point).compile()
-        assert compiled.memory_analysis().temp_size_in_bytes < 2**20
+        for bounds in ("point", "window"):
+            look = jax.jit(functools.partial(sense, sensor=sensor, bounds=bounds))
+            assert look.lower(frame, point).compile().memory_analysis().temp_size_in_bytes < 2**20
 
 
 @pytest.mark.parametrize("name", TABLE_II)
