@@ -199,7 +199,7 @@ class LearnerConfig:
     value_weight: float = 0.5
     vision_weight: float = 0.25  # of both of the vision head's losses
     value_target: Literal["n_step", "lambda"] = "lambda"  # to the rollout's end, or mixed as the advantages are
-    vision_bootstrap: Literal["consistent", "literal"] = "consistent"
+    vision_bootstrap: Literal["consistent", "literal"] = "consistent"  # of the vision head's n-step returns
     natural: HeadConfig = HeadConfig()
     vision: HeadConfig = HeadConfig()
 

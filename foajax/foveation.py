@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ def sense(
     focal_point: Int[Array, "2"],
     *,
     sensor: Sensor,
-    bounds: Literal["window", "point"] = "point",
+    bounds: str = "point",
 ) -> tuple[Float[Array, "_ _ _"], ...]:
     """What the sensor sees of a frame: float32 images [h, w, c], one a part (see `image_shapes`).
 
@@ -63,12 +63,14 @@ def sense(
       frame: uint8 or float, in any range.
       focal_point: (y, x), frame pixels.
       sensor: static.
-      bounds: static, as in `foajax.gaze`. With 'point' the area may overhang the frame; with 'window' it is moved
+      bounds: static, 'point' or 'window' as in `foajax.gaze`. With 'point' the area may overhang the frame; with 'window' it is moved
         inside where it would, and then sensing takes about half the time.
 
     Raises:
-      ConfigError: a peripheral grid finer than the frame; bounds 'window' and an area larger than it.
+      ConfigError: a peripheral grid finer than the frame; other bounds, or 'window' and an area larger than the frame.
     """
+    if bounds not in ("window", "point"):
+        raise ConfigError(f"bounds={bounds}: accepted is 'window' or 'point'")
     corner = focal_point - np.array(sensor.window) // 2
     if bounds == "window":
         room = np.array(frame.shape[:2]) - sensor.window

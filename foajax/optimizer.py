@@ -65,8 +65,8 @@ def adam(
     b2: float,
     eps: float,
     max_grad_norm: float | None,
-    full_rate_inputs: int | None = None,
-    amsgrad: bool = True,
+    full_rate_inputs: int | None,
+    amsgrad: bool,
 ) -> optax.GradientTransformationExtraArgs:
     """AMSGrad (Reddi et al. 2018) in PyTorch's form; without `amsgrad`, Adam (Kingma & Ba 2015).
 

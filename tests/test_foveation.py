@@ -126,6 +126,8 @@ def test_within_bounds_an_area_that_would_overhang_is_moved_inside(name):
 def test_bounds_that_an_area_cannot_keep_are_refused():
     with pytest.raises(ConfigError, match=r"bounds=window: accepted is 'point' where .* \(9, 4\) exceeds \(8, 8\)"):
         sense(jnp.zeros((8, 8)), jnp.array([4, 4]), sensor=RingSensor(((9, 4, 1),)), bounds="window")
+    with pytest.raises(ConfigError, match="bounds=frame: accepted is 'window' or 'point'"):
+        sense(jnp.zeros((8, 8)), jnp.array([4, 4]), sensor=RingSensor(((4, 4, 1),)), bounds="frame")
 
 
 def test_the_convention_by_hand():
