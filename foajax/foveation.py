@@ -63,7 +63,7 @@ def sense(
       frame: uint8 or float, in any range.
       focal_point: (y, x), frame pixels.
       sensor: static.
-      bounds: static, 'point' or 'window' as in `foajax.gaze`. With 'point' the area may overhang the frame; with 'window' it is moved
+      bounds: static, as in `foajax.gaze`. With 'point' the area may overhang the frame; with 'window' it is moved
         inside where it would, and then sensing takes about half the time.
 
     Raises:
