@@ -123,7 +123,7 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     ("key", "value", "line"),
     [
         ("learner__learning_rate", 0.002, "learner.learning_rate=0.002: the run in {run} has 0.001; "),
-        ("learner__vision__beta", 0.5, "learner.vision.beta=0.5: the run in {run} has 0.01; "),
+        ("learner__vision__beta", 0.5, "learner.vision.beta=0.5: the run in {run} has 0.003; "),
         ("learner__clip_ratio", 0.2, "learner.clip_ratio=0.2: the run in {run} has 0.1; "),
         ("game", "pong", "game=pong: the run in {run} has breakout; "),
         ("seed", 3, "seed=3: the run in {run} has 0; "),
