@@ -68,7 +68,7 @@ def loss(
     mask_t = 1.0 - steps.is_first[1:].astype(jnp.float32)  # the step after an episode's end is nobody's
     transitions = (steps.reward[1:], is_terminal_t, mask_t)
 
-    heads = [_natural_targets(config, *transitions, output.natural_value)]
+    heads = [_natural_targets(config.natural, *transitions, output.natural_value)]
     if output.vision_value is not None:
         heads.append(_vision_targets(config, *transitions, output.vision_value))
     valid = _whole(jnp.stack([losses.valid_steps(targets.mask_t) for targets in heads]), axis)
@@ -104,20 +104,19 @@ def loss(
 class Targets(NamedTuple):
     """What one head learns from, constants to its loss."""
 
-    returns: Float[Array, "T B"]
+    returns: Float[Array, "T B"]  # n-step
     advantages: Float[Array, "T B"]
     mask_t: Float[Array, "T B"]  # 1 where the step enters the loss
 
 
-def _natural_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
-    head = config.natural
-
+def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
     def one(r_t, is_terminal_t, mask_t, v):
         discount_t = head.gamma * (1.0 - is_terminal_t)
-        advantages = returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda)
-        n_step = returns.n_step_returns(r_t, discount_t, mask_t, v[1:])
-        target = n_step if config.value_target == "n_step" else v[:-1] + advantages
-        return Targets(returns=target, advantages=advantages, mask_t=mask_t)
+        return Targets(
+            returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
+            advantages=returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda),
+            mask_t=mask_t,
+        )
 
     return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
 
@@ -127,11 +126,11 @@ def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mas
 
     def one(r_t, is_terminal_t, mask_t, v):
         stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
-        advantages = returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda)
-        n_step = returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap)
-        target = n_step if config.value_target == "n_step" else v[:-1] + advantages
-        mask_t = returns.vision_stream(r_t, is_terminal_t, mask_t).loss_mask_t
-        return Targets(returns=target, advantages=advantages, mask_t=mask_t)
+        return Targets(
+            returns=returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap),
+            advantages=returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda),
+            mask_t=returns.vision_stream(r_t, is_terminal_t, mask_t).loss_mask_t,
+        )
 
     return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
 
@@ -156,13 +155,14 @@ def _head_loss(
     reduce = functools.partial(losses.reduce_steps, mask_t=targets.mask_t, steps=valid, shards=shards)
     mean = functools.partial(reduce, reduction="mean")
     advantages = targets.advantages
+    target = targets.returns if config.value_target == "n_step" else value + advantages
     if config.normalize_advantages:
         centred = advantages - _whole(mean(advantages), axis)
         advantages = centred / (jnp.sqrt(_whole(mean(centred**2), axis)) + 1e-8)
     policy = losses.policy_loss(
         logits, action, advantages, behaviour_log_prob=behaviour_log_prob, clip_ratio=config.clip_ratio
     )
-    error = losses.value_loss(value, targets.returns)
+    error = losses.value_loss(value, target)
     entropy = losses.entropy(logits)
     total = policy - head.beta * entropy + config.value_weight * error
     metrics = {"policy_loss": mean(policy), "value_loss": mean(error), "entropy": mean(entropy), "value": mean(value)}
