@@ -64,7 +64,7 @@ def sense(
       focal_point: (y, x), frame pixels.
       sensor: static.
       bounds: static, as in `foajax.gaze`. With 'point' the area may overhang the frame; with 'window' it is moved
-        inside where it would, and then sensing takes about half the time.
+        inside where it would, and then sensing takes about two thirds of the time.
 
     Raises:
       ConfigError: a peripheral grid finer than the frame; other bounds, or 'window' and an area larger than the frame.
