@@ -195,7 +195,6 @@ def _look(frame: Num[Array, "H W"], corner: Int[Array, "2"], sensor: Sensor) -> 
         window = _apart(_gather_window(frame, start + state[0], size), corner)
         return jnp.zeros_like(state[0]), _pool(window, sensor)
 
-    # What the loop carries is finished: another pass over it would cost a third of the whole.
     parts = _pool(lax.dynamic_slice(frame, start, size), sensor)
     return lax.while_loop(lambda state: jnp.any(state[0] != 0), look_again, (corner - start, parts))[1]
 
