@@ -92,6 +92,7 @@ def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
     torsos = {int(name[6:]): convolutions(own) for name, own in params.items() if name.startswith("torso_")}
     dense = linear(params["dense"]) if "dense" in params else None
     project = linear(params["lstm_input"])
+    norm = [leaf(params["lstm_norm"][name]) for name in ("scale", "bias")] if "lstm_norm" in params else None
     recurrent = leaf(params["lstm_recurrent"], 1, 0)
     heads = [
         linear(params[n]) for n in ("natural_policy", "natural_value", "vision_policy", "vision_value") if n in params
@@ -103,7 +104,10 @@ def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
         features = F.relu(dense(features)) if dense else features
         if focal_point is not None:
             features = torch.cat([features, focal_point], 1)
-        gates = project(features).reshape(*keep.shape[:2], -1)
+        gates = project(features)
+        if norm:
+            gates = F.layer_norm(gates, gates.shape[-1:], *norm, eps=1e-6)
+        gates = gates.reshape(*keep.shape[:2], -1)
         cell, hidden = state
         outputs = []
         for t in range(keep.shape[0]):

@@ -156,6 +156,7 @@ class NetworkConfig:
     torso: Literal["nature", "a3c"] = "nature"
     dense: int = 256  # units between torso and LSTM; 0 for none
     lstm: int = 256
+    lstm_norm: bool = True  # layer norm of the input's part of the LSTM's gates
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 
     def __post_init__(self) -> None:

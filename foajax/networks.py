@@ -97,6 +97,9 @@ class Network(nn.Module):
             features = jnp.concatenate([features, focal_point.reshape(steps * batch, 2)], axis=-1)
         width = self.config.lstm
         projected = nn.Dense(4 * width, kernel_init=nn.initializers.orthogonal(1.0), name="lstm_input")(features)
+        if self.config.lstm_norm:
+            # Ba et al. (2016). Without it a long training drives the gates to 0 and 1, and the score stands still.
+            projected = nn.LayerNorm(name="lstm_norm")(projected)
         recurrent = self.param("lstm_recurrent", _gate_orthogonal, (width, 4 * width))
         hidden, core_state = lstm(projected.reshape(steps, batch, 4 * width), recurrent, is_first, core_state)
         natural_logits, natural_value = self.head("natural", hidden, self.num_natural_actions)

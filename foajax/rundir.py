@@ -140,6 +140,8 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
         if not isinstance(mapping, dict):
             raise ConfigError("is not the configuration of a run (no mapping)")
+        if isinstance(mapping.get("network"), dict):
+            mapping["network"].setdefault("lstm_norm", False)  # as it was before there was this key
         config = from_mapping(mapping)
     except FileNotFoundError:
         raise RunError(f"run={path}: has no {_CONFIG}; accepted is the directory of a run") from None

@@ -77,6 +77,19 @@ def test_environments_do_not_mix_and_episodes_do_not_leak():
     assert not reached[:, 0].any()
 
 
+@pytest.mark.parametrize("norm", [True, False])
+def test_large_weights_drive_the_gates_to_their_ends_only_without_the_norm(norm):
+    config, network, params = build("experiment=constant50_sub2_packed", f"network.lstm_norm={str(norm).lower()}")
+    params = params()
+    roi, focal_point, is_first = inputs(config, 3, 2)
+    state = initial_core_state(network, 2)
+    inner = params["params"]
+    assert ("lstm_norm" in inner) == norm
+    large = {"params": inner | {"lstm_input": jax.tree.map(lambda x: 1000.0 * x, inner["lstm_input"])}}
+    before, after = (network.apply(p, roi, focal_point, is_first, state)[0].natural_value for p in (params, large))
+    assert np.allclose(before, after, atol=1e-3) == norm
+
+
 def test_the_initial_policies_are_about_uniform():
     config, network, params = build("experiment=constant70")
     roi, focal_point, is_first = inputs(config, 3, 2)

@@ -87,6 +87,16 @@ def test_config_survives_the_file_in_every_detail(config, tmp_path):
         assert load_config(each.run_dir) == each
 
 
+def test_a_run_from_before_the_lstm_norm_has_none(config):
+    open_run(config, command=COMMAND).close()
+    file = Path(config.run_dir) / "config.yaml"
+    mapping = yaml.safe_load(file.read_text())
+    assert load_config(config.run_dir).network.lstm_norm
+    del mapping["network"]["lstm_norm"]
+    file.write_text(yaml.safe_dump(mapping))
+    assert not load_config(config.run_dir).network.lstm_norm
+
+
 def test_load_config_follows_a_moved_run(config, tmp_path):
     open_run(config, command=COMMAND).close()
     Path(config.run_dir).rename(tmp_path / "moved")
