@@ -68,8 +68,9 @@ def test_a_decision_adds_dense_layers_lstm_and_little_else():
     products = 2 * (2304 * 256 + 256 * 1024 + 256 * 1024 + 256 * 5)
     rest = record["decision_flops"] - record["torso_flops"] - products
     assert 0 < rest < 0.01 * record["decision_flops"]
+    norm = 2 * 1024  # scale and bias
     biases, torso = 256 + 1024 + 5, 64 * 32 + 32 + 16 * 32 * 64 + 64 + 9 * 64 * 64 + 64
-    assert record["params"] == products // 2 + biases + torso
+    assert record["params"] == products // 2 + biases + norm + torso
 
 
 def test_the_paper_s_pixel_counts_and_its_claim():
