@@ -50,9 +50,9 @@ class Options:
     out: str | None = None
 
     def __post_init__(self) -> None:
-        for key in ("num_envs", "repeats"):
-            if getattr(self, key) < 1:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
+        for key, least in (("num_envs", 1), ("repeats", 5)):
+            if getattr(self, key) < least:
+                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= {least}")
 
 
 def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
