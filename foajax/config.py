@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -220,6 +221,9 @@ class LearnerConfig:
             _check(value is None or value > 0, f"learner.{key}", value, "null or a number > 0")
         for key in ("value_weight", "vision_weight"):
             _check(getattr(self, key) >= 0, f"learner.{key}", getattr(self, key), "a number >= 0")
+        applies = self.vision_bootstrap == "consistent" or self.value_target == "n_step"
+        accepted = f"consistent where learner.value_target={self.value_target}"
+        _check(applies, "learner.vision_bootstrap", self.vision_bootstrap, accepted)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,6 +311,10 @@ class Config:
                 self.sensor.peripheral,
                 f"a grid no finer than env.frame_shape={height}x{width}",
             )
+        if self.gaze.mode in ("learned", "random") and self.gaze.bounds == "window":
+            key = "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius"
+            accepted = f"point, or gaze=none: {key} fills env.frame_shape={height}x{width} and could not move"
+            _check(self.sensor.window != (height, width), "gaze.bounds", self.gaze.bounds, accepted)
         points = self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ())
         for point in points:
             _check(
@@ -382,7 +390,7 @@ def build(cls: Any, value: Any, key: str) -> Any:
     for field in dataclasses.fields(cls):
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in value:
-            raise ConfigError(f"{prefix}{field.name}: missing; accepted is {_describe(hints[field.name])}")
+            raise ConfigError(f"{prefix}{field.name}: missing; accepted is {describe(hints[field.name])}")
     kwargs = {name: _convert(hints[name], v, f"{prefix}{name}") for name, v in value.items()}
     try:
         return cls(**kwargs)
@@ -405,10 +413,10 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
                 return _convert(option, value, key)
             except ConfigError:
                 continue
-        raise ConfigError(f"{key}={_show(value)}: accepted is {_describe(hint)}")
+        raise ConfigError(f"{key}={_show(value)}: accepted is {describe(hint)}")
     if dataclasses.is_dataclass(hint):
         return build(hint, value, key)
-    accepted = ConfigError(f"{key}={_show(value)}: accepted is {_describe(hint)}")
+    accepted = ConfigError(f"{key}={_show(value)}: accepted is {describe(hint)}")
     if origin is Literal:
         for option in args:
             if type(option) is type(value) and option == value:
@@ -430,24 +438,25 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
         if value is None:
             return None
     elif hint is float:
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
             return float(value)
     elif type(value) is hint:
         return value
     raise accepted
 
 
-def _describe(hint: Any) -> str:
+def describe(hint: Any) -> str:
+    """What a type accepts, in words."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         return "one of " + ", ".join(str(a) for a in args)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_describe(a) for a in args)
+        return " or ".join(describe(a) for a in args)
     if origin is tuple:
         if args[-1] is Ellipsis:
-            return f"a list of {_describe(args[0])}"
-        return "[" + ", ".join(_describe(a) for a in args) + "]"
+            return f"a list of {describe(args[0])}"
+        return "[" + ", ".join(describe(a) for a in args) + "]"
     if origin is not None:
-        return f"a mapping to {_describe(args[1])}"
+        return f"a mapping to {describe(args[1])}"
     plain = {int: "an integer", float: "a finite number", bool: "true or false", str: "a string", type(None): "null"}
     return plain.get(hint, "a mapping")

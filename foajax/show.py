@@ -206,7 +206,7 @@ def show(arguments: Sequence[str]) -> None:
     """The command; prints the path of what it wrote."""
     options = cli.parse(Options, arguments)
     sheet = options.all or options.sensor == "all"
-    words = [f"game={options.game}", f"seed={options.seed}"]
+    words = [f"game={options.game}", f"seed={options.seed}", "gaze=none"]
     configs = {name: compose([f"sensor={name}", *words]) for name in (_ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape

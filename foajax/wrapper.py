@@ -156,8 +156,10 @@ class _Eye:
         gaze = gaze or GazeConfig()
         if not gaze.learned:
             raise ConfigError(f"gaze.mode={gaze.mode}: accepted is learned, for visual actions from outside")
-        # What a run is checked for, a wrapped environment is checked for too.
-        Config(name="wrapper", sensor=sensor, gaze=gaze, env=EnvConfig(frame_shape=(box.shape[0], box.shape[1])))
+        # What a run is checked for, a wrapped environment is checked for too. But the whole frame may be a baseline
+        # here, which a gaze that has to move is refused.
+        still = dataclasses.replace(gaze, mode="frozen")
+        Config(name="wrapper", sensor=sensor, gaze=still, env=EnvConfig(frame_shape=(box.shape[0], box.shape[1])))
         return cls(box=box, sensor=sensor, gaze=gaze)
 
     @property

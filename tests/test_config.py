@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foajax.config import Config, ConfigError, LogPolarSensor, RingSensor, from_mapping, to_mapping
+from foajax.config import Config, ConfigError, GazeConfig, LogPolarSensor, RingSensor, from_mapping, to_mapping
 
 RINGS = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
-LOG_POLAR = Config(name="logpolar", sensor=LogPolarSensor())
+LOG_POLAR = Config(name="logpolar", sensor=LogPolarSensor(), gaze=GazeConfig(bounds="point"))
 
 
 def paths(mapping, prefix=()):
@@ -62,7 +62,7 @@ EVERY_PATH = pytest.mark.parametrize(
 )
 
 plain_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=100),
+    st.none() | st.booleans() | st.integers() | st.just(10**400) | st.floats() | st.text(max_size=100),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text("abc.", max_size=5), inner, max_size=3),
     max_leaves=8,
 )
@@ -146,6 +146,7 @@ OUT_OF_RANGE = [
     ("gaze.step", 0),
     ("gaze.step", 2**31),
     ("gaze.bounds", "frame"),
+    ("sensor.rings", [[80, 80, 2]]),  # the gaze could not move
     ("gaze.start", [80, 0]),
     ("gaze.start", "center"),
     ("gaze.path", [[0, -1]]),
@@ -188,6 +189,7 @@ OUT_OF_RANGE = [
     ("learner.value_weight", -1.0),
     ("learner.vision_weight", float("inf")),
     ("learner.vision_bootstrap", "other"),
+    ("learner.vision_bootstrap", "literal"),  # of n-step returns only
     ("learner.natural.gamma", 1.01),
     ("learner.natural.gae_lambda", -0.01),
     ("learner.vision.gamma", -1),
@@ -220,7 +222,7 @@ def test_a_log_polar_value_out_of_range_is_refused_by_name(key, value):
     ("key", "value"),
     [
         ("seed", 0),
-        ("sensor.rings", [[80, 80, 80]]),
+        ("sensor.rings", [[80, 79, 79]]),
         ("sensor.rings", [[30, 50, 1], [30, 51, 3]]),
         ("sensor.peripheral", [80, 80]),
         ("gaze.start", [0, 79]),
@@ -247,6 +249,7 @@ def test_a_value_at_the_edge_is_taken(key, value):
 
 def test_a_window_larger_than_the_frame_needs_a_gaze_that_bounds_the_point_alone():
     wide = changed(LOG_POLAR, ("sensor", "radius"), 60.0)
+    wide["gaze"]["bounds"] = "window"
     assert error(wide).startswith("sensor.radius=")
     wide["gaze"]["bounds"] = "point"
     assert from_mapping(wide).sensor.window == (120, 120)

@@ -254,7 +254,7 @@ def test_an_atari_game():
     ale_py = pytest.importorskip("ale_py")
     gymnasium.register_envs(ale_py)
     env = FoveatedObservation(gymnasium.make("ALE/Breakout-v5", obs_type="rgb"), "constant70_packed")
-    check_env(env.unwrapped if env.spec is None else env, skip_render_check=True)
+    check_env(env, skip_render_check=True)
     observation, _ = env.reset(seed=0)
     assert observation["image"].shape == (35, 35, 3)
     env.close()
