@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import json
 import sys
+import typing
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
 import yaml
 
-from foajax.config import ConfigError, build
+from foajax.config import ConfigError, build, describe
 
 Options = TypeVar("Options")
 
@@ -17,22 +20,42 @@ Options = TypeVar("Options")
 def parse(options: type[Options], arguments: Sequence[str]) -> Options:
     """Builds `options` from `key=value` words, values read as YAML; raises `ConfigError`."""
     values: dict[str, Any] = {}
+    hints = typing.get_type_hints(options)
     for word in arguments:
         key, separator, text = word.partition("=")
         if not separator:
             names = ", ".join(field.name for field in dataclasses.fields(cast(Any, options)))
             raise ConfigError(f"{word}: accepted is key=value with one of {names}")
+        is_text = hints.get(key) in (str, str | None) and text not in ("", "null")
         try:
-            values[key] = yaml.safe_load(text) if text else None
-        except yaml.YAMLError:
+            values[key] = text if is_text else yaml.safe_load(text or "null")
+        except (yaml.YAMLError, ValueError):  # the latter from what looks like a date
             raise ConfigError(f"{key}={text}: accepted is a YAML value") from None
     return build(options, values, "")
 
 
 def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; what the user can mend is one line on stderr and exit code 2."""
+    """Runs a command; what the user can mend is one line on stderr and exit code 2.
+
+    `--help` prints what the command's module says of itself, and the keys of its `Options`.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    module = sys.modules[command.__module__]
+    if not {"-h", "--help"}.isdisjoint(words) and hasattr(module, "Options"):
+        print(_help(module))
+        return 0
     try:
-        return command(sys.argv[1:] if arguments is None else arguments) or 0
+        return command(words) or 0
     except ConfigError as error:
         print(f"foajax: error: {error}", file=sys.stderr)
         return 2
+
+
+def _help(module: Any) -> str:
+    hints = typing.get_type_hints(module.Options)
+    lines = [inspect.cleandoc(module.__doc__ or ""), ""]
+    for field in dataclasses.fields(module.Options):
+        value = field.default
+        shown = "required" if value is dataclasses.MISSING else value if isinstance(value, str) else json.dumps(value)
+        lines.append(f"  {field.name}={shown}: {describe(hints[field.name])}")
+    return "\n".join(lines)

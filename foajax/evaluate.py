@@ -22,7 +22,8 @@ from foajax.envs import make
 from foajax.store import load_agent
 from foajax.types import FrameStatistics, Params
 
-EVALUATION_SEED = 1_000_003  # apart from the seeds of training
+_FIRST_SEED = 1_000_003  # apart from the seeds of training
+_SEEDS = 2**31 - 2_000_000  # the engines take 32 bits, and add an environment's number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Options:
     run: str  # a run directory or a shipped agent
     episodes: int = 30
     policy: Literal["sampled", "greedy"] = "sampled"
+    checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     json: str | None = None  # file for the result
     num_envs: int = 30  # games played at once
     seed: int = 0
@@ -40,6 +42,8 @@ class Options:
         for key in ("episodes", "num_envs"):
             if getattr(self, key) < 1:
                 raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
+        if self.json and not Path(self.json).absolute().parent.is_dir():
+            raise ConfigError(f"json={self.json}: accepted is a file in a directory that exists")
 
 
 class Games(NamedTuple):
@@ -47,6 +51,13 @@ class Games(NamedTuple):
 
     returns: np.ndarray  # [episodes] unclipped
     lengths: np.ndarray  # [episodes] agent steps
+
+
+def environment_seed(seed: int) -> int:
+    """Of the environments that an agent is watched in with `seed`; raises `ConfigError`."""
+    if not 0 <= seed < _SEEDS:
+        raise ConfigError(f"seed={seed}: accepted is an integer from 0 to {_SEEDS - 1}")
+    return _FIRST_SEED + seed
 
 
 def play(
@@ -65,7 +76,7 @@ def play(
     """
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
-    environment = make(config, num_envs=num_envs, seed=EVALUATION_SEED + seed)
+    environment = make(config, num_envs=num_envs, seed=environment_seed(seed))
     agent = Agent(config, environment.num_actions, environment.crop_top)
     act = jax.jit(functools.partial(agent.act, greedy=greedy))
     state = agent.initial_state(num_envs)
@@ -93,7 +104,7 @@ def play(
 def evaluate(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
-    stored = load_agent(options.run)
+    stored = load_agent(options.run, best=options.checkpoint == "best")
     config = stored.agent.config
     games = play(
         config,

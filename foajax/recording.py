@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 from foajax import envs
 from foajax.agent import Agent
 from foajax.config import Config
-from foajax.evaluate import EVALUATION_SEED
+from foajax.evaluate import environment_seed
 from foajax.foveation import sense
 from foajax.painting import packed
 from foajax.store import Stored
@@ -116,7 +116,7 @@ def record(
     names = envs.action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
     decide = jax.jit(functools.partial(_decide, stored.agent, greedy))
     for game in range(seed, seed + episodes):
-        environment = envs.make(config, num_envs=1, seed=EVALUATION_SEED + game, render=_in_colour(config))
+        environment = envs.make(config, num_envs=1, seed=environment_seed(game), render=_in_colour(config))
         try:
             played = _play(environment, stored, decide, jax.random.key(game), max_steps, progress)
         finally:

@@ -30,6 +30,7 @@ import yaml
 from foajax import durable
 from foajax.config import Config, ConfigError, from_mapping, to_mapping
 
+PARAMETERS = "agent.safetensors"  # of a shipped agent, which is no run
 _CONFIG = "config.yaml"
 _RECORD = "run.json"
 _FAILURE = "failure.txt"
@@ -45,6 +46,11 @@ _PACKAGES = (
     "ale-py",
     "gymnasium",
 )
+# Keys that runs have not always had, and what was done before: older runs are read as they were made.
+_BEFORE = {
+    "network": {"lstm_norm": False},
+    "learner": {"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step"},
+}
 # What may change between two starts of a run: none of it changes what a step learns.
 _FREE = {
     *("run", "profile", "env.threads", "env.timeout"),
@@ -76,8 +82,7 @@ class RunDir:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, Exception):
-            with contextlib.suppress(OSError):
-                (self.path / _FAILURE).write_text(describe_error(error) + "\n", encoding="utf-8")
+            note_failure(self.path, describe_error(error))
         self.close()
 
 
@@ -93,7 +98,7 @@ def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
       command: the words that started this process, for the record.
 
     Raises:
-      RunError: the directory cannot be created, written or read, is in use, or holds another run.
+      RunError: the directory cannot be created, written or read, is in use, or holds another run or a shipped agent.
     """
     path = Path(config.run_dir)
     try:
@@ -102,6 +107,9 @@ def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
         raise RunError(f"run={path}: is a file; accepted is a directory") from None
     except (OSError, ValueError) as error:
         raise RunError(f"run={path}: cannot be created ({_reason(error)}); choose another run=<dir>") from None
+    if os.path.lexists(path / PARAMETERS):
+        accepted = f"another run=<dir>, with train.init_from={path} to begin from its parameters"
+        raise RunError(f"run={path}: is a shipped agent; accepted is {accepted}")
     run_dir = RunDir(path, _take_lock(path))
     try:
         _settle_config(path, config)
@@ -140,8 +148,9 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
         if not isinstance(mapping, dict):
             raise ConfigError("is not the configuration of a run (no mapping)")
-        if isinstance(mapping.get("network"), dict):
-            mapping["network"].setdefault("lstm_norm", False)  # as it was before there was this key
+        for group, before in _BEFORE.items():
+            if isinstance(mapping.get(group), dict):
+                mapping[group] = before | mapping[group]
         config = from_mapping(mapping)
     except FileNotFoundError:
         raise RunError(f"run={path}: has no {_CONFIG}; accepted is the directory of a run") from None
@@ -169,6 +178,12 @@ def is_held(path: Path) -> bool:
     except OSError:
         return False
     return False
+
+
+def note_failure(path: Path, why: str) -> None:
+    """Keeps why this start of the run in `path` failed."""
+    with contextlib.suppress(OSError):
+        (path / _FAILURE).write_text(why + "\n", encoding="utf-8")
 
 
 def failure(path: Path) -> str | None:

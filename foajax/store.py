@@ -11,7 +11,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +25,10 @@ from foajax.agent import Agent
 from foajax.checkpoint import Checkpoints
 from foajax.config import ConfigError, to_mapping
 from foajax.programs import make_state
-from foajax.rundir import load_config
+from foajax.rundir import PARAMETERS, is_run, load_config
 from foajax.types import FrameStatistics, Params, TrainState
 
 _FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
-_PARAMETERS = "agent.safetensors"
 CHECKPOINTS = "checkpoints"
 
 
@@ -56,8 +55,12 @@ def load_score(path: str | Path) -> dict[str, Any] | None:
         return None
 
 
-def load_agent(path: str | Path) -> Stored:
-    """Reads a run directory (newest good checkpoint) or a shipped agent; raises `ConfigError`."""
+def load_agent(path: str | Path, *, best: bool = False) -> Stored:
+    """Reads a shipped agent or, of a run, the newest good checkpoint, or the `best` kept by its score in training.
+
+    Raises:
+      ConfigError: there is neither, or it cannot be read.
+    """
     path = Path(path)
     config = load_config(path)
     try:
@@ -65,11 +68,11 @@ def load_agent(path: str | Path) -> Stored:
         agent = Agent(config, facts["num_actions"], facts["crop_top"])
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"run={path}: {_FACTS} is missing or not readable; accepted is a run or an agent") from None
-    if (path / _PARAMETERS).exists():
-        return _load_shipped(agent, path / _PARAMETERS, facts.get("env_steps", 0))
+    if (path / PARAMETERS).exists():
+        return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
     template = jax.eval_shape(lambda: make_state(agent, 0))
     checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
-    restored = checkpoints.restore_part({"train": template})
+    restored = checkpoints.restore_part({"train": template}, best=best)
     if restored is None:
         raise ConfigError(f"run={path}: has no checkpoint yet")
     env_steps, state, _ = restored
@@ -98,14 +101,22 @@ def begin_from(path: str, state: TrainState) -> TrainState:
 
 
 def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None = None) -> None:
-    """Writes a shipped agent: float32 arrays by name, the configuration and the facts, its score among them."""
-    directory.mkdir(parents=True, exist_ok=True)
-    arrays = named((stored.params, stored.statistics))
-    save_file(arrays, directory / _PARAMETERS)
+    """Writes a shipped agent: float32 arrays by name, the configuration and the facts, its score among them.
+
+    Raises:
+      ConfigError: `directory` is a run's, or cannot be written.
+    """
+    if is_run(directory):
+        raise ConfigError(f"out={directory}: is a run; accepted is another directory")
     config = to_mapping(dataclasses.replace(stored.agent.config, run=None))  # where it was trained does not matter
-    (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     known = {} if score is None else {"score": dict(score)}
-    save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        save_file(named((stored.params, stored.statistics)), directory / PARAMETERS)
+        (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+        save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"out={directory}: accepted is a directory that can be written ({error})") from None
 
 
 def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
@@ -144,6 +155,7 @@ class Options:
 
     run: str
     out: str
+    checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     score: str | None = None  # file that `evaluate json=` has written, to go with the agent
 
 
@@ -151,8 +163,8 @@ def export(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
     score = None if options.score is None else _read_score(Path(options.score))
-    save_agent(load_agent(options.run), Path(options.out), score)
-    print(f"{options.out}: {_PARAMETERS}, config.yaml, {_FACTS}")
+    save_agent(load_agent(options.run, best=options.checkpoint == "best"), Path(options.out), score)
+    print(f"{options.out}: {PARAMETERS}, config.yaml, {_FACTS}")
 
 
 if __name__ == "__main__":

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 
+import jax
+import numpy as np
 import pytest
 
-from foajax import cli, demo, store
+from foajax import cli, demo, evaluate, store
+from foajax.config import ConfigError
 
 EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}
 
@@ -66,5 +69,58 @@ def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
     assert "accepted is a file that evaluate json=<file> has written" in capsys.readouterr().err
 
 
+def test_a_run_is_not_overwritten_by_an_agent(breakout_agent, tmp_path):
+    store.save_agent(breakout_agent, tmp_path / "run")
+    (tmp_path / "run" / "run.json").write_text('{"starts": []}')
+    before = (tmp_path / "run" / "config.yaml").stat().st_mtime_ns
+    with pytest.raises(ConfigError, match=r"out=.*/run: is a run; accepted is another directory"):
+        store.save_agent(breakout_agent, tmp_path / "run")
+    assert (tmp_path / "run" / "config.yaml").stat().st_mtime_ns == before
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"out=.*/file: accepted is a directory that can be written"):
+        store.save_agent(breakout_agent, tmp_path / "file")
+
+
+SHIPPED = sorted(file.parent for file in demo.agents().glob("*/config.yaml"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=[path.name for path in SHIPPED])
+def test_a_shipped_agent_can_be_read_and_has_its_score(path):
+    stored = store.load_agent(path)
+    assert stored.agent.config.game in path.name and stored.env_steps > 1e6
+    assert store.load_score(path)["episodes"] == 30
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((stored.params, stored.statistics)))
+
+
+@pytest.mark.slow
+def test_a_shipped_agent_plays_as_well_as_it_says():
+    stored = store.load_agent(demo.agents() / "pong-nonfoa")
+    arguments = stored.agent.config, stored.params, stored.statistics
+    games = evaluate.play(*arguments, episodes=2, num_envs=2, seed=0, greedy=False)
+    assert games.returns.mean() > 10
+
+
 def test_agents_are_beside_a_checkout():
-    assert demo.agents().name == "agents" and (demo.agents() / "README.md").exists()
+    assert demo.agents().name == "agents" and len(SHIPPED) >= 4
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("json=nowhere/score.json", "json=nowhere/score.json: accepted is a file in a directory that exists"),
+        ("seed=2147483647", "seed=2147483647: accepted is an integer from 0 to"),
+        ("seed=-1", "seed=-1: accepted is an integer from 0 to"),
+        ("checkpoint=last", "checkpoint=last: accepted is one of newest, best"),
+        ("run=2026-13-01", "run=2026-13-01: does not exist"),  # text, though it looks like a date
+    ],
+)
+def test_an_evaluation_that_cannot_be_is_refused_before_it_plays(shipped, capsys, word, said):
+    assert cli.run(evaluate.evaluate, [f"run={shipped / 'good'}", word]) == 2
+    assert capsys.readouterr().err.startswith(f"foajax: error: {said}")
+
+
+def test_help_names_every_key(capsys):
+    assert cli.run(demo.demo, ["--help"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("`python -m foajax.demo`")
+    assert "\n  steps=6000: an integer\n" in out and "\n  game=null: a string or null\n" in out

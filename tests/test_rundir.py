@@ -77,7 +77,7 @@ def test_every_start_is_added(config):
 
 def test_config_survives_the_file_in_every_detail(config, tmp_path):
     log_polar = dataclasses.replace(
-        changed(config, learner__learning_rate=1e-5, learner__adam_eps=3e-17, gaze__start=[40, 41]),
+        changed(config, learner__adam_eps=3e-17, gaze__start=[40, 41], gaze__bounds="point"),
         sensor=LogPolarSensor(),
         game="gymnasium:ALE/Pong-v5",
         run=str(tmp_path / "other"),
@@ -87,14 +87,31 @@ def test_config_survives_the_file_in_every_detail(config, tmp_path):
         assert load_config(each.run_dir) == each
 
 
-def test_a_run_from_before_the_lstm_norm_has_none(config):
+def test_a_shipped_agent_is_not_taken_for_a_run(config):
+    path = Path(config.run_dir)
+    path.mkdir(parents=True)
+    (path / "agent.safetensors").touch()
+    said = f"run={path}: is a shipped agent; accepted is another run=<dir>, with train.init_from={path} to begin "
+    assert refusal(config).startswith(said)
+    assert [entry.name for entry in path.iterdir()] == ["agent.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("group", "key", "before"),
+    [
+        ("network", "lstm_norm", False),
+        ("learner", "full_rate_inputs", None),
+        ("learner", "amsgrad", True),
+        ("learner", "value_target", "n_step"),
+    ],
+)
+def test_a_run_from_before_a_key_is_read_as_it_was_made(config, group, key, before):
     open_run(config, command=COMMAND).close()
     file = Path(config.run_dir) / "config.yaml"
     mapping = yaml.safe_load(file.read_text())
-    assert load_config(config.run_dir).network.lstm_norm
-    del mapping["network"]["lstm_norm"]
+    assert getattr(getattr(load_config(config.run_dir), group), key) == mapping[group].pop(key) != before
     file.write_text(yaml.safe_dump(mapping))
-    assert not load_config(config.run_dir).network.lstm_norm
+    assert getattr(getattr(load_config(config.run_dir), group), key) == before
 
 
 def test_load_config_follows_a_moved_run(config, tmp_path):
@@ -140,7 +157,7 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
         ("env__frame_shape", [84, 84], "env.frame_shape=[84, 84]: the run in {run} has [80, 80]; "),
         ("env__crop_top", {"default": 30}, "env.crop_top.default=30: the run in {run} has 34; "),
         ("env__crop_top", {"default": 34}, "env.crop_top.beam_rider=null: the run in {run} has 20; "),
-        ("sensor", {"kind": "logpolar"}, "sensor.kind=logpolar: the run in {run} has rings; "),
+        ("sensor", {"kind": "logpolar", "radius": 30.0}, "sensor.kind=logpolar: the run in {run} has rings; "),
     ],
 )
 def test_another_meaning_is_refused_by_name(config, key, value, line):
