@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 from unittest import mock
 
 import jax
@@ -32,6 +32,8 @@ from jaxlib import _jax
 
 from foajax import coordinator
 from foajax.config import Config, ConfigError, check_shares
+
+T = TypeVar("T")
 
 EXIT_CODE = 75  # the system's "temporary failure": start the same command again
 _STARTING = 300  # seconds that processes wait for each other until all have started
@@ -91,6 +93,18 @@ class Job:
         if self.is_first:
             client.key_value_set(f"foajax/{name}", text)
         return client.blocking_key_value_get(f"foajax/{name}", 1000 * _STARTING)
+
+    def by_first(self, name: str, task: Callable[[], T]) -> T | None:
+        """What process 0 gets from `task`, None in the others; its `ConfigError` is raised in all."""
+        result, problem = None, ""
+        if self.is_first:
+            try:
+                result = task()
+            except ConfigError as error:
+                problem = str(error)
+        if problem := self.tell(f"problem: {name}", problem):
+            raise ConfigError(problem)
+        return result
 
 
 def start(config: Config) -> Job:
@@ -246,6 +260,8 @@ class Watch:
         if not self._ending.acquire(blocking=False):
             threading.Event().wait()  # the other thread ends the process
         place = f"process {self._job.index} of {self._job.count}"
-        said = f"foajax: error: {place}: another process died or hangs ({reason}); {self._rescue()}"
-        print(said, file=sys.stderr, flush=True)
-        os._exit(EXIT_CODE)  # an orderly end would wait for the others
+        try:
+            said = f"foajax: error: {place}: another process died or hangs ({reason}); {self._rescue()}"
+            print(said, file=sys.stderr, flush=True)
+        finally:
+            os._exit(EXIT_CODE)  # an orderly end would wait for the others

@@ -73,8 +73,14 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.exe
                 run = waiting.popleft()
                 _say(f"{run.config.run_dir}: starting")
                 taken[run.config.run_dir] = cores = shares.popleft()
-                with _on(cores):
-                    stop.processes[run.config.run_dir] = _start(run, command, alone=jobs == 1)
+                try:
+                    with _on(cores):
+                        stop.processes[run.config.run_dir] = process = _start(run, command, alone=jobs == 1)
+                    if stop.requested:  # while it started
+                        process.send_signal(signal.SIGTERM)
+                except OSError as error:
+                    shares.append(taken.pop(run.config.run_dir))
+                    failures[run.config.run_dir] = f"cannot be started ({error})"
             time.sleep(_POLL)
             for directory, process in list(stop.processes.items()):
                 if (code := process.poll()) is not None:

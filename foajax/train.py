@@ -26,7 +26,7 @@ from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state, use_compilation_cache
 from foajax.rollout import Collector, update_on
-from foajax.rundir import RunDir, open_run, take_over
+from foajax.rundir import RunDir, note_failure, open_run, take_over
 from foajax.sharding import Layout
 from foajax.snapshots import snapshots
 from foajax.store import CHECKPOINTS, begin_from, save_facts
@@ -123,6 +123,9 @@ class Run:
         finally:
             self._watch.rest()
             self._finish()
+        if not self._is_saved():
+            reason = f"{self._env_steps:,} env_steps were not saved, {self._newest():,} were"
+            raise ConfigError(f"run={self._config.run_dir}: {reason}; accepted is a directory that can be written")
         self._say(self._how_it_ends(stop.name or ("a signal to another process" if self._stop_agreed else None)))
 
     def _loop(self, stop: StopRequest) -> None:
@@ -196,7 +199,7 @@ class Run:
         self._checkpoints.wait()
         self._checkpoints.save(*self._kept)
         self._checkpoints.wait()
-        return f"saved at {self._kept[0]:,} env_steps; the same command goes on from here"
+        return f"saved at {self._newest():,} env_steps; the same command goes on from here"
 
     def _check(self, metrics: list[Metrics]) -> None:
         """Stops a run whose updates are not finite time after time."""
@@ -262,7 +265,8 @@ class Run:
         """Takes over the newest good checkpoint, if there is one."""
         games = self._job.gather(self._collector.get_state())
         template = self._everything(games)
-        restored = self._checkpoints.restore(template) if self._checkpoints is not None else None
+        checkpoints = self._checkpoints
+        restored = self._job.by_first("checkpoints", lambda: checkpoints.restore(template) if checkpoints else None)
         found = json.loads(self._job.tell("restored", json.dumps(restored and [restored.env_steps, restored.meta])))
         if found is None:
             self._env_steps, self._games = 0, games
@@ -288,7 +292,7 @@ class Run:
         return max(self._checkpoints.steps(), default=0) if self._checkpoints is not None else 0
 
     def _is_saved(self) -> bool:
-        return self._checkpoints is None or self._env_steps == self._newest()
+        return self._checkpoints is None or self._env_steps in (0, *self._checkpoints.steps())
 
     def _finish(self) -> None:
         """Saves what the last update left, before the process ends, and waits for it."""
@@ -306,6 +310,8 @@ class Run:
         self._finish()
         if code:
             report_fault(self._config, why, None)
+            if self._checkpoints is not None:
+                note_failure(Path(self._config.run_dir), why)
         else:
             self._say(self._how_it_ends(why))
 
@@ -346,19 +352,6 @@ def make_environments(config: Config, env_steps: int, job: Job | None = None) ->
     return [envs.make(config, num_envs=batch, seed=seed) for seed in seeds]
 
 
-def open_run_once(config: Config, job: Job, resources: contextlib.ExitStack) -> RunDir | None:
-    """The run's directory, held by the first process; the others get None, or why it cannot be used."""
-    run_dir, problem = None, ""
-    if job.is_first:
-        try:
-            run_dir = resources.enter_context(open_run(config, command=[sys.executable, *sys.argv]))
-        except ConfigError as error:
-            problem = str(error)
-    if problem := job.tell("problem", problem):
-        raise ConfigError(problem)
-    return run_dir
-
-
 def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:
     """One line on stderr about an environment that raised or hung; returns the exit code."""
     run_dir = Path(config.run_dir)
@@ -388,6 +381,8 @@ def train(config: Config) -> int:
 def _train(config: Config) -> None:
     with contextlib.ExitStack() as resources:
         if config.profile:
+            if config.train.devices > 1 or config.distributed.processes:
+                raise ConfigError("profile=true: accepted is train.devices=1 and a single process")
             environments = make_environments(config, 0)
             for environment in environments:
                 resources.callback(environment.close)
@@ -397,7 +392,8 @@ def _train(config: Config) -> None:
         if config.train.dump_skipped and len(job.devices) > 1:
             raise ConfigError("train.dump_skipped=true: accepted is false where a run has several devices")
         stop = StopRequest()
-        run_dir = open_run_once(config, job, resources)
+        command = [sys.executable, *sys.argv]
+        run_dir = job.by_first("run", lambda: resources.enter_context(open_run(config, command=command)))
         try:
             run = Run(config, job, run_dir, resources)
         except OSError as error:  # its files: whatever an environment raises is a fault of its own

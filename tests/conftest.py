@@ -8,6 +8,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports jax
 
 import jax
 import numpy as np
+import processes
 import pytest
 from jaxtyping import install_import_hook
 
@@ -21,6 +22,16 @@ def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled programs between test runs: most of the time of a first run is compilation."""
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+@pytest.fixture(autouse=True)
+def no_process_is_left():
+    """A test that fails would else leave its training to run beside all that follow."""
+    yield
+    while processes.STARTED:
+        process = processes.STARTED.pop()
+        if process.poll() is None:
+            process.kill()
 
 
 @pytest.fixture(scope="session")

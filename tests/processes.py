@@ -24,10 +24,14 @@ TINY = [
 ]
 
 
+STARTED: list[subprocess.Popen[str]] = []  # by the test that runs
+
+
 def start(*arguments: str, module: str = "train", **options: Any) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", f"foajax.{module}", *arguments]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, text=True, **(pipes | options))
+    STARTED.append(subprocess.Popen(command, text=True, **(pipes | options)))
+    return STARTED[-1]
 
 
 def finish(*arguments: str, module: str = "train", **options: Any) -> tuple[int, str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -252,6 +253,17 @@ def test_a_directory_that_cannot_be_used_ends_all_in_one_line(tmp_path):
         _, err = process.communicate(timeout=100)
         assert process.returncode == 2, err
         assert "is a file; accepted is a directory" in err
+
+
+@pytest.mark.slow
+def test_unusable_checkpoints_end_all_in_one_line(one, tmp_path):
+    run = shutil.copytree(one, tmp_path / "run")
+    for sums in run.glob("checkpoints/*/SHA256SUMS"):
+        sums.unlink()
+    for process in start_job(2, f"run={run}", "train.env_steps=1280"):
+        _, err = process.communicate(timeout=100)
+        assert process.returncode == 2, err
+        assert "no usable checkpoint in" in err
 
 
 def test_devices_have_to_share_a_minibatch_evenly():

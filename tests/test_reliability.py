@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from processes import TINY, finish, newest, rows, start, wait_for
 from safetensors.numpy import load_file
 from test_checkpoint import Trap, damage_last_byte
 
+from foajax import durable
 from foajax.checkpoint import Checkpoints
 from foajax.store import load_agent
 
@@ -79,17 +81,18 @@ def test_a_file_that_cannot_be_written_at_the_start_is_one_line(tmp_path, name):
 
 def test_the_best_so_far_is_kept_over_starts(run):
     steps = Checkpoints(run / "checkpoints", keep=None).steps()
-    scored = {step: s for step in steps if (s := score(run, step)) is not None}
-    best = max(scored, key=lambda step: (scored[step], step))
+    best = run / "checkpoints" / str(steps[0])  # made so: nothing that comes will be better
+    meta = json.loads((best / "meta.json").read_text())
+    meta["meta"]["score"] = 999.0
+    (best / "meta.json").write_text(json.dumps(meta))
+    durable.seal(best)
     before = rows(run)[-1]
-    assert before["best_score"] >= scored[best]
     code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=16000", "train.keep=1")
     assert code == 0, err
     after = rows(run)[-1]
     assert after["games"] > before["games"] and after["best_score"] >= before["best_score"]
     left = Checkpoints(run / "checkpoints", keep=None).steps()
-    assert max(score(run, step) for step in left) >= scored[best]
-    assert len(left) <= 2 and 16000 in left
+    assert left == [steps[0], 16000] and score(run, steps[0]) == 999.0
 
 
 def test_numbers_that_overflow_end_a_run_with_a_diagnosis_and_good_parameters(tmp_path):
@@ -141,3 +144,11 @@ def test_a_full_disk_stops_nothing(small_disk, tmp_path):
     assert process.returncode == 0
     assert "Traceback" not in log.read_text()
     assert load_agent(run).env_steps == newest(run) == rows(run)[-1]["env_steps"]
+
+
+def test_a_run_whose_end_is_not_saved_says_so(run):
+    """Something is in the way of the last checkpoint."""
+    (run / "checkpoints" / ".12800.new").touch()
+    code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=12800")
+    assert code == 2 and "done" not in out, out
+    assert re.search(r"run=.*: 12,800 env_steps were not saved, 12,\d{3} were; accepted is a directory", err), err

@@ -68,6 +68,15 @@ def test_one_after_another_or_some_at_a_time(make):
         assert max(running) == jobs
 
 
+def test_a_run_that_cannot_be_started_does_not_end_the_sweep(make, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    lost = sweep.Run((str(tmp_path), "finish"), compose([f"run={tmp_path / 'file' / 'run'}", "train.env_steps=100"]))
+    good = make("good", "finish")
+    assert sweep.run_all([lost, good], jobs=2, command=COMMAND) == 1
+    assert len(times(good)) == 2
+    assert f"failed: {lost.config.run_dir}: cannot be started (" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot say where a process runs")
 def test_runs_beside_one_another_share_the_cores(make):
     def cores_of(run):

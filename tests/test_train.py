@@ -12,10 +12,12 @@ import pytest
 from processes import TINY, finish, has_rows, rows, start, wait_for
 
 from foajax.checkpoint import Checkpoints
+from foajax.compose import compose
+from foajax.config import ConfigError
 from foajax.distributed import Job
 from foajax.rundir import load_config, open_run
 from foajax.store import load_agent, save_agent
-from foajax.train import Run
+from foajax.train import Run, train
 
 
 def same(one, other):
@@ -189,6 +191,12 @@ def test_another_meaning_is_refused_by_name(breakout):
     run, _ = breakout
     code, _, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "learner.learning_rate=0.01")
     assert code == 2 and len(err.splitlines()) == 1 and "learner.learning_rate=0.01: the run in" in err
+
+
+def test_a_profile_is_of_one_device(tmp_path):
+    config = compose([*TINY, "profile=true", "train.devices=2", f"run={tmp_path}"])
+    with pytest.raises(ConfigError, match="profile=true: accepted is train.devices=1 and a single process"):
+        train(config)
 
 
 def test_a_profile_is_a_trace_and_a_table(tmp_path):

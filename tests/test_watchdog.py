@@ -17,6 +17,7 @@ from processes import TINY, finish, newest, rows
 
 from foajax import compose, train
 from foajax.jax_envs import JaxEnvironment
+from foajax.rundir import failure
 from foajax.store import load_agent
 from foajax.watchdog import FAULT, EnvironmentFault, Watchdog
 
@@ -145,6 +146,7 @@ def test_a_failing_environment_costs_nothing_that_was_learned(tmp_path, fault, s
     assert err == f"foajax: error: {line}; details in {run}/fault.txt\n"
     assert newest(run) == 80
     assert "tests/faulty.py" in (run / "fault.txt").read_text()
+    assert said in str(failure(run))
     code, out, err = faulty(run, "")
     assert code == 0, err
     assert "resumed at 80 env_steps" in out and "done: 400 env_steps" in out
