@@ -29,15 +29,20 @@ def compose(overrides: Sequence[str] = ()) -> Config:
       ConfigError: an unknown key or choice, a malformed override, or a value of the wrong type or range.
     """
     import hydra
+    from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     words = [_checked(word, sweep=False) for word in overrides]
+    outer = GlobalHydra.instance().hydra  # of an application that uses this package
+    GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(_directory()), version_base="1.3"):
             node = hydra.compose("base", words)
     except (HydraException, OmegaConfBaseException, ValueError, LookupError) as error:
         raise ConfigError(f"{_one_line(*overrides)}: {_first_line(error)}; accepted is key=value") from None
+    finally:
+        GlobalHydra.instance().hydra = outer
     return _config(node)
 
 

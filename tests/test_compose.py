@@ -10,6 +10,7 @@ import sysconfig
 import venv
 from pathlib import Path
 
+import hydra
 import pytest
 import yaml
 
@@ -114,7 +115,7 @@ def test_an_experiment_has_its_name_and_its_sensor(name):
 
 @pytest.mark.parametrize("name", [*TABLE_II, *PACKED, "logpolar"])
 def test_a_sensor_can_be_swapped_alone(name):
-    config = compose([f"sensor={name}"])
+    config = compose([f"sensor={name}", "gaze.bounds=point"])
     assert config.sensor == composed(f"experiment={name}").sensor
     assert config.name == "constant70"
 
@@ -348,6 +349,21 @@ def test_help_lists_the_experiments_and_cfg_prints_the_run(cwd, runs, capsys):
     assert run(runs.record, ["--cfg", "job", "seed=7"]) == 0
     assert yaml.safe_load(capsys.readouterr().out)["seed"] == 7
     assert runs == [] and list(cwd.iterdir()) == []
+
+
+def test_composing_works_inside_another_application_of_hydra(tmp_path):
+    (tmp_path / "theirs.yaml").write_text("key: 1")
+    with hydra.initialize_config_dir(str(tmp_path), version_base="1.3"):
+        assert compose(["experiment=nonfoa"]).name == "nonfoa"
+        with pytest.raises(ConfigError):
+            compose(["seed=many"])
+        assert hydra.compose("theirs").key == 1
+
+
+def test_a_learner_and_a_network_can_be_chosen_for_seek():
+    config = composed("experiment=seek", "learner=paper", "network=a3c")
+    assert config.learner == composed("learner=paper").learner and config.network == composed("network=a3c").network
+    assert composed("experiment=seek").learner.epochs == 4 and composed("experiment=seek").network.lstm == 64
 
 
 def test_composing_works_from_any_directory(cwd):
