@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from foajax import logpolar
 from foajax.config import ConfigError, LogPolarSensor, RingSensor, Sensor
+from foajax.types import HostArray
 
 Shape = tuple[int, int]  # rows, columns
 
@@ -37,8 +38,8 @@ class PixelCount(NamedTuple):
 
 
 def sense(
-    frame: Num[Array, "H W *C"],
-    focal_point: Int[Array, "2"],
+    frame: Num[HostArray, "H W *C"],
+    focal_point: Int[HostArray, "2"],
     *,
     sensor: Sensor,
     bounds: str = "point",
@@ -60,7 +61,7 @@ def sense(
     A `LogPolarSensor` gives one image [rings, wedges, c]; see `foajax.logpolar`.
 
     Args:
-      frame: uint8 or float, in any range.
+      frame: uint8 or finite float, in any range.
       focal_point: (y, x), frame pixels.
       sensor: static.
       bounds: static, as in `foajax.gaze`. With 'point' the area may overhang the frame; with 'window' it is moved
@@ -71,6 +72,7 @@ def sense(
     """
     if bounds not in ("window", "point"):
         raise ConfigError(f"bounds={bounds}: accepted is 'window' or 'point'")
+    frame, focal_point = jnp.asarray(frame), jnp.asarray(focal_point)
     corner = focal_point - np.array(sensor.window) // 2
     if bounds == "window":
         room = np.array(frame.shape[:2]) - sensor.window
@@ -93,7 +95,8 @@ def picture(
 ) -> Float[Array, "H W C"]:
     """What `sense` gave, put back in the frame's place; 0 where nothing was seen.
 
-    Both layouts of a `RingSensor` give the canvas; a log-polar image is warped back.
+    Both layouts of a `RingSensor` give the canvas; a log-polar image is warped back. `focal_point` is where the area
+    lay: with bounds 'window', the point after it was moved inside.
     """
     if isinstance(sensor, RingSensor) and sensor.layout == "canvas":
         return images[0]

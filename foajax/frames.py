@@ -70,7 +70,10 @@ def frame_statistics(frame: Float[Array, "H W"]) -> tuple[Float[Array, ""], Floa
 def pixel_statistics(
     frame: Float[Array, "H W"], statistics: FrameStatistics
 ) -> tuple[Float[Array, "H W"], Float[Array, ""]]:
-    """One frame's part in statistics whose mean is by pixel: itself, and its deviation from the mean so far."""
+    """One frame's part in statistics whose mean is by pixel: itself, and its deviation from the mean so far.
+
+    While nothing has been seen, the deviation is that of the frame's pixels from each other.
+    """
     mean, _ = _corrected(statistics, frame)
     return frame, jnp.sqrt(jnp.mean(jnp.square(frame - mean)))
 

@@ -37,8 +37,8 @@ def policy_loss(
     action: Int[Array, "*N"],
     advantage: Float[Array, "*N"],
     *,
-    behaviour_log_prob: Float[Array, "*N"] | None = None,
-    clip_ratio: float | None = None,
+    behaviour_log_prob: Float[Array, "*N"],
+    clip_ratio: float | None,
 ) -> Float[Array, "*N"]:
     """Policy term of one head, without the entropy.
 
@@ -46,15 +46,11 @@ def policy_loss(
     clipped surrogate of PPO (Schulman et al. 2017, eq. 7), where mu is the policy that acted:
 
         -min(ratio A, clip(ratio, 1 - clip_ratio, 1 + clip_ratio) A),  ratio = pi(a) / mu(a)
-
-    Raises `ValueError` where `clip_ratio` comes without `behaviour_log_prob`.
     """
     advantage = jax.lax.stop_gradient(advantage)
     log_pi = log_prob(logits, action)
     if clip_ratio is None:
         return -log_pi * advantage
-    if behaviour_log_prob is None:
-        raise ValueError(f"behaviour_log_prob=None: accepted is an array where clip_ratio={clip_ratio}")
     log_ratio = log_pi - jax.lax.stop_gradient(behaviour_log_prob)
     ratio = jnp.exp(jnp.minimum(log_ratio, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1.0 - clip_ratio, 1.0 + clip_ratio)

@@ -60,8 +60,6 @@ class A3CTorso(nn.Module):
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
         for features, kernel, border in ((32, 5, 2), (32, 5, 1), (64, 4, 1), (64, 3, 1)):
             x = jnp.pad(x, ((0, 0), (border, border), (border, border), (0, 0)))
-            if min(x.shape[1:3]) < kernel:
-                break
             x = Convolution(features, kernel)(x)
             x = nn.relu(max_pool(x) if min(x.shape[1:3]) > 4 else x)
         return x.reshape(x.shape[0], -1)

@@ -59,7 +59,7 @@ def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: tuple, *, donate:
 def total_updates(agent: Agent) -> int:
     """Minibatch updates until `train.env_steps`, for the learning-rate schedule."""
     config = agent.config
-    rollouts = max(1, config.train.env_steps // (config.env.num_envs * config.learner.rollout_length))
+    rollouts = -(-config.train.env_steps // (config.env.num_envs * config.learner.rollout_length))
     return rollouts * config.learner.minibatches * config.learner.epochs
 
 

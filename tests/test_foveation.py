@@ -242,6 +242,14 @@ def test_odd_sizes_match_the_oracle(scene):
             np.testing.assert_allclose(image[index, ..., 0], wanted, atol=1e-5)
 
 
+@pytest.mark.parametrize("bounds", ["point", "window"])
+def test_numpy_frames_are_frames_too(bounds):
+    frame, sensor = random_frames((80, 80)), RingSensor(((30, 30, 2),), layout="packed")
+    (actual,) = sense(frame, np.array([12, 70]), sensor=sensor, bounds=bounds)
+    (expected,) = sense(jnp.asarray(frame), jnp.array([12, 70]), sensor=sensor, bounds=bounds)
+    np.testing.assert_array_equal(actual, expected)
+
+
 @pytest.mark.parametrize(
     "sensor",
     [

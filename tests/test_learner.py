@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import compose, learner
+from foajax import compose, learner, losses
 from foajax.agent import Agent
 from foajax.frames import PIXEL_DECAY
-from foajax.programs import make_programs, make_state
+from foajax.programs import make_programs, make_state, total_updates
 from foajax.rollout import Collector, update_on
 from foajax.train import make_environments
 
@@ -227,10 +227,27 @@ def test_information_is_what_decisions_tell_of_what_was_seen(seek):
 
 
 def test_two_groups_see_what_each_would_alone():
-    """Groups only interleave: the first of two, with the whole batch's parameters, acts as it would by itself."""
-    loops = [Loop("game=seek", *VIEW, f"env.groups={groups}") for groups in (1, 2)]
-    shapes = [[r.steps.reward.shape for r in loop.collect()[0]] for loop in loops]
-    assert shapes == [[(7, 8)], [(7, 4), (7, 4)]]
+    """Groups only interleave: the first of two acts as it would by itself."""
+    loop = Loop("game=seek", *VIEW, "env.groups=2")
+    alone = Collector(loop.agent, loop.programs, make_environments(loop.config, 0)[:1], seed=0)
+    (expected,), _ = alone.collect(loop.state, 0)
+    (first, second), _ = loop.collect()
+    jax.tree.map(np.testing.assert_array_equal, expected.steps, first.steps)
+    assert first.steps.reward.shape == second.steps.reward.shape == (7, 4)
+    loop.run(2)
+    assert loop.programs.update._cache_size() == 1
+
+
+def test_unrolling_a_rollout_gives_what_acting_saw(seek):
+    """Clipped ratios are 1 before the first update only if both know the same memory, gaze and episodes."""
+    (rollout,), _ = seek.collect()
+    while not rollout.steps.is_first[1:].any():
+        (rollout,), _ = seek.collect()
+    assert np.any(rollout.core_state.hidden != 0)
+    output = seek.agent.unroll(seek.state.params, rollout)
+    for head in ("natural", "vision"):
+        actual = losses.log_prob(getattr(output, f"{head}_logits"), getattr(rollout.steps, f"{head}_action"))
+        np.testing.assert_allclose(actual, getattr(rollout.steps, f"{head}_log_prob"), atol=1e-5)
 
 
 def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
@@ -241,6 +258,11 @@ def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
     first, second, other = (jax.tree.leaves(loop.state.params) for loop in runs)
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+def test_the_schedule_counts_the_updates_of_a_rollout_that_has_begun():
+    config = compose.compose([*SMALL, "learner.epochs=3", "train.env_steps=49"])  # rollouts of 48
+    assert total_updates(Agent(config, 4, 34)) == 2 * 2 * 3
 
 
 PROBE = [*VIEW, "learner.learning_rate=2e-3", "learner.natural.gamma=0.5", "train.env_steps=1000000"]

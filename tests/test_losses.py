@@ -93,8 +93,12 @@ def test_log_prob_and_its_gradient_are_finite_at_the_limits():
 # ----- the policy's loss
 
 
+def plain_loss(logits, action, advantage, behaviour_log_prob):
+    return losses.policy_loss(logits, action, advantage, behaviour_log_prob=behaviour_log_prob, clip_ratio=None)
+
+
 def test_policy_loss_is_that_of_each_step(steps, compiled):
-    actual = compiled(losses.policy_loss)(steps["logits"], steps["action"], steps["advantage"])
+    actual = compiled(plain_loss)(**steps)
     expected = -numpy_log_prob(steps["logits"], steps["action"]) * np.asarray(steps["advantage"])
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
@@ -103,7 +107,7 @@ def test_gradient_of_the_policy_loss(steps):
     """A (pi - onehot), step by step: no step reaches another's logits, or the advantage."""
 
     def total(logits, advantage):
-        return losses.policy_loss(logits, steps["action"], advantage).sum()
+        return plain_loss(**{**steps, "logits": logits, "advantage": advantage}).sum()
 
     by_logits, by_advantage = jax.grad(total, (0, 1))(steps["logits"], steps["advantage"])
     expected = jax.nn.softmax(steps["logits"]) - jax.nn.one_hot(steps["action"], A)
@@ -146,9 +150,8 @@ def test_clipped_loss_by_hand(ratio, advantage, loss, slope):
 
 def test_clipped_loss_starts_with_the_plain_gradient(steps):
     on_policy = {**steps, "behaviour_log_prob": losses.log_prob(steps["logits"], steps["action"])}
-    plain = {k: v for k, v in steps.items() if k != "behaviour_log_prob"}
     gradient = lambda loss, args: jax.grad(lambda x: loss(**{**args, "logits": x}).sum())(args["logits"])  # noqa: E731
-    actual, expected = gradient(clipped_loss, on_policy), gradient(losses.policy_loss, plain)
+    actual, expected = gradient(clipped_loss, on_policy), gradient(plain_loss, steps)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
@@ -166,11 +169,6 @@ def test_clipped_loss_is_finite_for_any_ratio(advantage):
         args = array([0.0, 0.0], [0.0, -300.0]), jnp.array([0, 1]), array(advantage, advantage)
         loss, gradient = jax.value_and_grad(lambda *args: clipped_loss(*args).sum())(*args, jnp.full(2, behaviour))
         assert np.isfinite(loss) and np.isfinite(gradient).all()
-
-
-def test_clipping_needs_the_behaviour(steps):
-    with pytest.raises(ValueError, match="behaviour_log_prob=None.*clip_ratio=0.2"):
-        losses.policy_loss(steps["logits"], steps["action"], steps["advantage"], clip_ratio=0.2)
 
 
 # ----- the value's loss
