@@ -75,9 +75,7 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.exe
                 taken[run.config.run_dir] = cores = shares.popleft()
                 try:
                     with _on(cores):
-                        stop.processes[run.config.run_dir] = process = _start(run, command, alone=jobs == 1)
-                    if stop.requested:  # while it started
-                        process.send_signal(signal.SIGTERM)
+                        stop.processes[run.config.run_dir] = _start(run, command, alone=jobs == 1)
                 except OSError as error:
                     shares.append(taken.pop(run.config.run_dir))
                     failures[run.config.run_dir] = f"cannot be started ({error})"
