@@ -6,6 +6,8 @@ actions are an emulator's. An id may name the module that registers it, e.g. `gy
 
 from __future__ import annotations
 
+import functools
+
 import gymnasium
 import numpy as np
 from gymnasium import spaces
@@ -46,17 +48,13 @@ class GymnasiumEnvironment:
         self.num_envs, self.num_actions = num_envs, int(actions.n)
         self.screen_shape: tuple[int, ...] = config.env.frame_shape
         self._first_action, self._seed, self._clip = int(actions.start), seed, config.env.clip_rewards
-        self._rows, self._columns = (
-            area_weights(source, target)
-            for source, target in zip(observations.shape or (), self.screen_shape, strict=False)
-        )
 
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins all episodes, from the seed."""
         image, _ = self._env.reset(seed=self._seed)
         zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
         self._ended = false
-        timestep = TimeStep(self._frame(image), zeros, is_first=~false, is_terminal=false)
+        timestep = TimeStep(gray_frames(image, self.screen_shape), zeros, is_first=~false, is_terminal=false)
         return timestep, Outcome(score=zeros, is_over=false)
 
     def send(self, action: np.ndarray) -> None:
@@ -68,7 +66,7 @@ class GymnasiumEnvironment:
         image, score, terminated, truncated, _ = self._env.step(self._action)
         score = score.astype(np.float32)
         timestep = TimeStep(
-            frame=self._frame(image),
+            frame=gray_frames(image, self.screen_shape),
             reward=np.sign(score) if self._clip else score,
             is_first=self._ended,
             is_terminal=terminated.copy(),
@@ -84,14 +82,19 @@ class GymnasiumEnvironment:
         """Closes every environment."""
         self._env.close()
 
-    def _frame(self, image: np.ndarray) -> np.ndarray:
-        """uint8 images [B, h, w(, c)] as gray frames [B, H, W]: area means, rounded half up."""
-        if image.ndim == 4:
-            image = (image @ LUMA + 500) // 1000 if image.shape[-1] == 3 else image[..., 0]
-        means = self._rows @ image.astype(np.float32) @ self._columns.T
-        return np.floor(means + np.float32(0.5)).astype(np.uint8)
+
+def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
+    """Images, uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3] (RGB), as frames, uint8 [B, H, W] of `frame_shape`.
+
+    Gray by ITU-R BT.601, resized by area means, each rounded half up: what agents of Gymnasium environments see.
+    """
+    if images.ndim == 4:
+        images = (images @ LUMA + 500) // 1000 if images.shape[-1] == 3 else images[..., 0]
+    rows, columns = (area_weights(*sizes) for sizes in zip(images.shape[1:], frame_shape, strict=True))
+    return np.floor(rows @ images.astype(np.float32) @ columns.T + np.float32(0.5)).astype(np.uint8)
 
 
+@functools.cache
 def area_weights(source: int, target: int) -> np.ndarray:
     """[target, source] float32: the share of each source pixel in each target pixel, along one axis.
 

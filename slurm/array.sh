@@ -1,8 +1,10 @@
 #!/bin/bash
-# The paper's comparison as one job array: 7 models x 3 games x 3 seeds = 63 runs, each in a directory of its own
-# (runs/<game>-<experiment>-s<seed>). Submitted from the checkout, or from anywhere with foajax installed:
+# The paper's models as one job array: 7 models x 3 games x 3 seeds = 63 runs, each in a directory of its own
+# (runs/<game>-<experiment>-s<seed>). Submitted from the checkout, or from anywhere with foajax installed, with the
+# environment activated:
 #
-#   sbatch slurm/array.sh                                 # all of it
+#   sbatch slurm/array.sh                                 # all of it, with this package's learner
+#   sbatch slurm/array.sh learner=paper network=a3c 'run=runs/paper/${game}-${name}-s${seed}'  # with Table III's
 #   sbatch --array=0-62%8 slurm/array.sh                  # at most 8 at a time
 #   sbatch slurm/array.sh train.env_steps=20000000        # further words go to every run
 #   python -m foajax.status runs/                         # what they are doing

@@ -21,7 +21,8 @@
 
 # Before the time is up all processes are told to save (one would do: they stop together), and the job queues itself
 # again. Exit code 75 means that a process was lost and the others saved, one above 128 that it was a signal which took
-# it: the job goes on from there as well.
+# it: the job goes on from there as well, 20 times at most: what takes it each time
+# has to be looked at.
 trap 'again=1; kill -USR1 "$job"' USR1
 srun --kill-on-bad-exit=0 --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" \
   python -m foajax.train env.num_envs=256 env.threads="${SLURM_CPUS_PER_TASK:-1}" "$@" &
@@ -30,7 +31,7 @@ wait "$job"
 status=$?
 if [[ ${again-} ]]; then
   wait "$job" # the first wait ended with the signal
-elif ((status != 75 && status <= 128)); then
+elif ((status != 75 && status <= 128 || ${SLURM_RESTART_COUNT:-0} >= 20)); then
   exit "$status"
 fi
 scontrol requeue "$SLURM_JOB_ID"

@@ -1,0 +1,37 @@
+"""The code that the documents show runs as it stands there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+BLOCKS = [
+    pytest.param(block, id=f"{page}-{i}")
+    for page in ("README.md", "docs/embedding.md")
+    for i, block in enumerate(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL))
+]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("block", BLOCKS)
+def test_a_block_of_code_runs_and_gives_what_it_says(block, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    names: dict = {}
+    exec(block, names)
+    said = re.findall(r"^(\S.*)  # ((?:Dict)?\(.*)$", block, re.MULTILINE)
+    for expression, value in said:
+        assert str(eval(expression, names)) in (value, f"({value})")
+
+
+def test_there_are_blocks():
+    assert len(BLOCKS) == 4
+
+
+def test_links_lead_somewhere():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md"), *ROOT.glob("*/README.md")]
+    for page in pages:
+        for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert (page.parent / link).exists(), (page.name, link)
