@@ -13,6 +13,7 @@ sum, at the same cost wherever the focal point is. Windows are squares of side 2
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 
 import jax.numpy as jnp
@@ -96,16 +97,18 @@ def _bilinear_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, n
 def _area_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(cell, pixel, share of the cell's area in that pixel), sorted by cell.
 
-    Measured with a grid of points in each cell, evenly spaced in area.
+    Measured with a grid of points in each cell, evenly spaced in area; ring by ring, to bound the memory.
     """
-    inner, outer = ring_edges(sensor)[:-1, None], ring_edges(sensor)[1:, None]
     fraction = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    radius = np.sqrt(inner**2 + (outer**2 - inner**2) * fraction)[:, None, :, None]
-    angle = 2 * np.pi * (np.arange(sensor.wedges)[:, None] + fraction) / sensor.wedges
-    side = sensor.window[0]
-    y, x = (np.floor(side / 2 + radius * turn(angle)[:, None, :]).astype(int) for turn in (np.sin, np.cos))
-    cell = np.arange(sensor.rings * sensor.wedges).reshape(sensor.rings, sensor.wedges, 1, 1)
-    hits, count = np.unique((cell * side + y) * side + x, return_counts=True)
+    wedge = np.arange(sensor.wedges)
+    angle = 2 * np.pi * (wedge[:, None] + fraction) / sensor.wedges
+    side, parts = sensor.window[0], []
+    for ring, (inner, outer) in enumerate(itertools.pairwise(ring_edges(sensor))):
+        radius = np.sqrt(inner**2 + (outer**2 - inner**2) * fraction)[:, None]
+        y, x = (np.floor(side / 2 + radius * turn(angle)[:, None, :]).astype(int) for turn in (np.sin, np.cos))
+        cell = (ring * sensor.wedges + wedge)[:, None, None]
+        parts.append(np.unique((cell * side + y) * side + x, return_counts=True))
+    hits, count = (np.concatenate(part) for part in zip(*parts, strict=True))
     return hits // side**2, hits % side**2, count / _SAMPLES**2
 
 
