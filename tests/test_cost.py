@@ -89,6 +89,11 @@ def test_the_other_torso():
     assert products < record["torso_flops"] < 1.02 * products
 
 
+def test_the_saving_is_what_the_readme_says():
+    full, packed = count("nonfoa", "a3c"), count("constant70_packed", "a3c")
+    assert [round(packed[f"{part}_flops"] / full[f"{part}_flops"], 2) for part in ("torso", "decision")] == [0.15, 0.18]
+
+
 @pytest.mark.slow
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "cost.json"

@@ -43,10 +43,13 @@ def smooth_frame(shape=(80, 80)):
     return (np.sin(y / 4 + x / 9) * np.cos(x / 5 - 1)).astype(np.float32)
 
 
+edges_of = functools.cache(logpolar.ring_edges)
+
+
 def cell_at(sensor, dy, dx):
     """(ring, wedge) of a place relative to the focal point, None outside."""
     radius, angle = math.hypot(dy, dx), math.atan2(dy, dx) % (2 * math.pi)
-    edges = logpolar.ring_edges(sensor)
+    edges = edges_of(sensor)
     inside = [ring for ring in range(sensor.rings) if edges[ring] <= radius < edges[ring + 1]]
     return (inside[0], int(angle / (2 * math.pi) * sensor.wedges)) if inside else None
 

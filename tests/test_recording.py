@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import envs
+from foajax import envs, evaluate
 from foajax.agent import Agent
 from foajax.compose import compose
 from foajax.evaluate import play
@@ -15,6 +15,7 @@ from foajax.gaze import DIRECTIONS
 from foajax.heatmap import bounds
 from foajax.painting import packed
 from foajax.recording import Screens, record
+from foajax.types import Outcome, TimeStep
 
 
 def test_every_row_is_there(recording):
@@ -79,6 +80,62 @@ def test_a_game_is_the_one_that_evaluation_plays(seeker):
     assert games[0].vision_probs is None and games[0].vision_value is None and games[0].lives is None
     assert games[0].actions == ("leave", "take") and games[0].env_steps == 7
     assert not np.array_equal(games[0].focal_point, games[1].focal_point)
+
+
+@pytest.mark.parametrize("gaze", ["frozen", "random", "scripted"])
+def test_a_gaze_that_is_not_learned_goes_where_its_control_says(untrained, gaze):
+    path = [(30, 50), (40, 2), (45, 44)]
+    words = [f"gaze={gaze}", "gaze.path=[[30,50],[40,2],[45,44]]", "network.dense=8", "network.lstm=8"]
+    agent = Agent(compose(["game=seek", "sensor=constant50_sub2", *words]), 2, None)
+    game = next(record(untrained(agent), max_steps=20))
+    low, high = bounds(agent.config)
+    if gaze == "scripted":
+        expected = [path[t % 3] for t in range(20)]
+    elif gaze == "frozen":
+        expected = [(40, 40)] * 20
+    else:
+        assert len(np.unique(game.vision_action)) > 2
+        expected = [(40, 40), *(game.focal_point + 4 * DIRECTIONS[game.vision_action])[:-1]]
+    np.testing.assert_array_equal(game.focal_point, np.clip(expected, low, high))
+
+
+def test_a_greedy_game_takes_the_likeliest_actions(breakout_agent):
+    game = next(record(breakout_agent, greedy=True, max_steps=20))
+    np.testing.assert_array_equal(game.natural_action, game.natural_probs.argmax(1))
+    np.testing.assert_array_equal(game.vision_action, game.vision_probs.argmax(1))
+
+
+class UnequalGames:
+    """Two environments: one whose games last 2 steps, one whose games last 5."""
+
+    num_actions, crop_top = 2, None
+
+    def reset(self):
+        self._age = np.zeros(2, int)
+        return self._seen(np.ones(2, bool)), None
+
+    def send(self, action):
+        self._age += 1
+
+    def recv(self):
+        is_over = self._age == np.array([2, 5])
+        is_first = self._age == np.array([3, 6])  # the step that begins the next game
+        self._age[is_first] = 0
+        return self._seen(is_first), Outcome(score=np.ones(2, np.float32) * ~is_first, is_over=is_over)
+
+    def _seen(self, is_first):
+        false = np.zeros(2, bool)
+        return TimeStep(np.zeros((2, 80, 80), np.uint8), np.zeros(2, np.float32), is_first=is_first, is_terminal=false)
+
+    def close(self):
+        pass
+
+
+def test_each_environment_plays_the_same_number_of_games(seeker, monkeypatch):
+    monkeypatch.setattr(evaluate, "make", lambda *_, **__: UnequalGames())
+    arguments = seeker.agent.config, seeker.params, seeker.statistics
+    games = play(*arguments, episodes=4, num_envs=2, seed=0, greedy=False)
+    assert sorted(games.lengths) == sorted(games.returns) == [2, 2, 5, 5]
 
 
 def test_a_recording_holds_what_the_sensor_gave(seeker):

@@ -61,8 +61,10 @@ def test_it_follows_the_definition(inputs, transform):
 
 
 def test_its_gradient_is_the_recurrences(inputs):
-    projected, kernel, is_first, state = inputs
+    assert_same_gradient(*inputs)
 
+
+def assert_same_gradient(projected, kernel, is_first, state):
     def total(function):
         def scalar(projected, kernel, state):
             hidden, last = function(projected, kernel, is_first, state)
@@ -97,3 +99,4 @@ def test_a_long_sequence_runs_as_a_loop():
     state = CoreState(cell=jnp.zeros((2, L)), hidden=jnp.zeros((2, L)))
     hidden, _ = lstm(projected, kernel, is_first, state)
     np.testing.assert_allclose(hidden, autodiff_lstm(projected, kernel, is_first, state)[0], atol=1e-5)
+    assert_same_gradient(projected, kernel, is_first, state)

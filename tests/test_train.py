@@ -59,8 +59,8 @@ def test_the_same_seed_gives_the_same_hundred_updates_on_the_emulators_too(break
     assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in again.items() if k != "time"}
 
 
-def test_a_finished_run_goes_on_when_more_is_asked_for(breakout):
-    run, _ = breakout
+def test_a_finished_run_goes_on_when_more_is_asked_for(breakout, tmp_path):
+    run = shutil.copytree(breakout[0], tmp_path / "run")
     code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=1200")
     assert code == 0, err
     assert "resumed at 1,000 env_steps (episodes start anew, emulators cannot be saved)" in out

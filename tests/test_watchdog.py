@@ -68,7 +68,7 @@ def test_work_outside_of_the_environments_may_take_its_time():
 
 
 def test_a_paused_process_is_not_taken_for_hung():
-    process = script("sleep(1)", timeout=2.5)
+    process = script("sleep(4)", timeout=3.0)  # of which 3.5 s are paused
     process.send_signal(signal.SIGSTOP)
     time.sleep(3.5)
     process.send_signal(signal.SIGCONT)
@@ -81,20 +81,16 @@ def test_a_paused_process_is_not_taken_for_hung():
     [
         ("sleep(1000)", False, True),  # stuck in an emulator
         ("while True: sleep(0.001)", False, True),  # deaf, but it comes to an emulator
-        ("time.sleep(3)", True, True),  # stuck elsewhere, with nothing to lose
+        ("time.sleep(1000)", True, True),  # stuck elsewhere, with nothing to lose
         ("time.sleep(3)", False, False),  # stuck elsewhere with what is not saved: waited for
     ],
 )
 def test_a_request_to_stop_is_answered_by_whoever_can(body, saved, ended):
     process = script(body, timeout=1000.0, saved=saved)
-    begin = time.monotonic()
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=20)
     assert process.returncode == 0
-    if ended:
-        assert out == "heard\nabandoned: SIGTERM (0)\n" and time.monotonic() - begin < 3
-    else:
-        assert out == "heard\nalive\n"
+    assert out == ("heard\nabandoned: SIGTERM (0)\n" if ended else "heard\nalive\n")
 
 
 def test_one_of_several_processes_leaves_a_request_to_stop_to_all_of_them():
