@@ -9,6 +9,7 @@ machine. Run it on an idle one.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import os
@@ -22,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foajax import cost
+from foajax import cli, cost
 from foajax.config import LogPolarSensor, RingSensor, Sensor
 from foajax.foveation import sense
 
@@ -122,11 +123,19 @@ def against_opencv() -> dict[str, float] | None:
     return {"foajax": sensed, "opencv": looped, "speedup": looped / sensed}
 
 
-def main(arguments: list[str]) -> None:
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes."""
+
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        cli.check_file("out", self.out)
+
+
+def main(arguments: Sequence[str]) -> None:
     """Runs all three and writes JSON where `out=<file>` says so."""
-    options = dict(argument.partition("=")[::2] for argument in arguments)
-    if set(options) - {"out"}:
-        sys.exit(f"benchmarks/foveation.py: {' '.join(arguments)}: accepted is out=<file>")
+    options = cli.parse(Options, arguments)
     cost.wait_in_place()
     results: dict[str, object] = {
         "device": jax.devices()[0].device_kind,
@@ -142,10 +151,10 @@ def main(arguments: list[str]) -> None:
     results["large_frame_us"] = large_frame()
     print("256 frames, constant70 packed, against a loop of OpenCV crop and resize")
     results["opencv_us"] = against_opencv()
-    if "out" in options:
-        with open(options["out"], "w") as file:
+    if options.out:
+        with open(options.out, "w") as file:
             json.dump(results, file, indent=2)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(cli.run(main))

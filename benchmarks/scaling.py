@@ -32,7 +32,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 from foajax import cli
 
@@ -54,6 +54,9 @@ class Options:
     coordinator: str = ""
     process: int = 0
 
+    def __post_init__(self) -> None:
+        cli.check_file("out", self.out)
+
 
 @dataclasses.dataclass(frozen=True)
 class Assumptions:
@@ -74,12 +77,14 @@ class Assumptions:
     delay: float = 20e-6  # of a message between hosts: assumed
 
 
-def start(arguments: Sequence[str], *, core: int | None = None, **variables: str) -> subprocess.Popen:
+def start(
+    arguments: Sequence[str], *, core: int | None = None, out: IO[str] | int = subprocess.PIPE, **variables: str
+) -> subprocess.Popen:
     """A Python process, on one core if asked."""
     pin = [] if core is None else ["taskset", "-c", str(core)]
     environment = os.environ | {"JAX_PLATFORMS": "cpu"} | variables
     return subprocess.Popen(
-        [*pin, sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*pin, sys.executable, *arguments], env=environment, stdout=out, stderr=subprocess.STDOUT, text=True
     )
 
 
@@ -112,7 +117,7 @@ def speed(run: Path, processes: Sequence[subprocess.Popen], seconds: float) -> f
         while len(logged := rows(run)) < 4 or logged[-1]["time"] - logged[2]["time"] < seconds:
             for process in processes:
                 if process.poll() is not None:
-                    raise RuntimeError(process.stdout.read() if process.stdout else process.args)
+                    raise RuntimeError(f"{process.args} ended; its output is above")
             time.sleep(0.2)
     finally:
         for process in processes:
@@ -131,7 +136,8 @@ def weak(options: Options) -> dict[str, Any]:
             address = free_address()
             words = [training(options, directory / name, processes, i, address) for i in range(processes)]
             words += [training(options, directory / f"{name}-beside", 1, 0, "")] * beside
-            started = [start(w, core=core) for core, w in enumerate(words)]
+            # A pipe that nobody reads would be full one day.
+            started = [start(w, core=core, out=sys.stderr) for core, w in enumerate(words)]
             return speed(directory / name, started, options.seconds)
 
         one = measure("one", 1)

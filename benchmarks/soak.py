@@ -25,6 +25,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+from foajax import cli
+from foajax.config import ConfigError
+
 _EVERY = 1.0  # seconds between two looks
 
 
@@ -112,7 +115,11 @@ def main(words: Sequence[str]) -> int:
     """The command."""
     ours = ("minutes=", "out=", "run=")
     options = dict(word.split("=", 1) for word in words if word.startswith(ours))
-    seconds = 60 * float(options.get("minutes", 30))
+    minutes = options.get("minutes", "30")
+    if not minutes.replace(".", "", 1).isdecimal() or float(minutes) < 2:
+        raise ConfigError(f"minutes={minutes}: accepted is a number >= 2")
+    cli.check_file("out", options.get("out"))
+    seconds = 60 * float(minutes)
     rest = [word for word in words if not word.startswith(ours)]
     with tempfile.TemporaryDirectory() as directory:
         samples, rows, code = train(rest, Path(options.get("run", f"{directory}/run")), seconds)
@@ -138,4 +145,4 @@ def _speed(rows: Sequence[dict]) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(cli.run(main))

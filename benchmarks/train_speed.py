@@ -64,8 +64,7 @@ class Options:
                 raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
         if self.seconds <= 0:
             raise ConfigError(f"seconds={self.seconds}: accepted is a number > 0")
-        if self.out and not Path(self.out).absolute().parent.is_dir():
-            raise ConfigError(f"out={self.out}: accepted is a file in a directory that exists")
+        cli.check_file("out", self.out)
 
 
 class Bench:

@@ -53,6 +53,7 @@ class Options:
         for key, least in (("num_envs", 1), ("repeats", 5)):
             if getattr(self, key) < least:
                 raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= {least}")
+        cli.check_file("out", self.out)
 
 
 def torch_network(params: dict, torso: str) -> tuple[Callable, list]:

@@ -8,6 +8,7 @@ import json
 import sys
 import typing
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import yaml
@@ -32,6 +33,12 @@ def parse(options: type[Options], arguments: Sequence[str]) -> Options:
         except (yaml.YAMLError, ValueError):  # the latter from what looks like a date
             raise ConfigError(f"{key}={text}: accepted is a YAML value") from None
     return build(options, values, "")
+
+
+def check_file(key: str, path: str | None) -> None:
+    """`ConfigError`, before anything long starts, where `path` is given and cannot be a file."""
+    if path is not None and (not Path(path).absolute().parent.is_dir() or Path(path).is_dir()):
+        raise ConfigError(f"{key}={path}: accepted is a file in a directory that exists")
 
 
 def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> int:

@@ -56,6 +56,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.repeats < 1:
             raise ConfigError(f"repeats={self.repeats}: accepted is an integer >= 1")
+        cli.check_file("json", self.json)
 
 
 class Subject(NamedTuple):
@@ -225,8 +226,6 @@ def cost(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     wait_in_place()
     names = list_experiments() if options.experiments is None else options.experiments.split(",")
-    if options.json and not Path(options.json).absolute().parent.is_dir():
-        raise ConfigError(f"json={options.json}: accepted is a file in a directory that exists")
     records = measure(names, torso=options.torso, repeats=options.repeats)
     _print(records)
     if options.json:

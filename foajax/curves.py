@@ -18,6 +18,7 @@ from foajax.rundir import load_config
 from foajax.scores import CONFIDENCE, RESAMPLES, Interval
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
+_LINES = ("-", "--", ":")  # once all colours are used
 _POINTS = 300  # of a curve
 AXES = {"env_steps": (1e6, "million agent steps"), "time": (3600.0, "hours of training")}
 
@@ -60,7 +61,9 @@ def read_run(path: str | Path) -> RunData:
         rows = [(row["env_steps"], row["time"], row["score"]) for row in rows if row.get("score") is not None]
         file = path / "score.json"
         evaluation = json.loads(file.read_text()) if file.exists() else None
-    except (OSError, ValueError, KeyError):
+        if evaluation is not None:
+            float(evaluation["mean"])
+    except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"run={path}: its metrics.jsonl or score.json is not readable") from None
     if not rows:
         raise ConfigError(f"run={path}: no game has ended in it yet; accepted is a run with scores")
@@ -92,9 +95,10 @@ def draw_curves(groups: Mapping[str, Sequence[RunData]], title: str, colours: Ma
     with rc_context(STYLE):
         figure = Figure(figsize=(10.4, 4.1), layout="constrained")
         plots = figure.subplots(1, 2, sharey=True)
+        lines = {name: _LINES[i // len(COLOURS) % len(_LINES)] for i, name in enumerate(colours)}
         for plot, (axis, (unit, label)) in zip(plots, AXES.items(), strict=True):
             for name, runs in groups.items():
-                _draw_group(plot, runs, axis, unit, colours[name], name)
+                _draw_group(plot, runs, axis, unit, {"color": colours[name], "linestyle": lines[name]}, name)
             plot.set_xlabel(label)
             plot.set_xlim(left=0)
             plot.grid(axis="y", color="#e6e6e6", linewidth=0.8)
@@ -106,18 +110,18 @@ def draw_curves(groups: Mapping[str, Sequence[RunData]], title: str, colours: Ma
     return figure
 
 
-def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, colour: str, name: str) -> None:
+def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, line: dict[str, str], name: str) -> None:
     if len(runs) > 1:
         for run in runs:
-            plot.plot(getattr(run, axis) / unit, run.score, color=colour, linewidth=0.6, alpha=0.45)
+            plot.plot(getattr(run, axis) / unit, run.score, **line, linewidth=0.6, alpha=0.45)
         mean, label = band(runs, axis), f"{name} ({len(runs)} seeds)"
         if mean is None:
-            plot.plot([], [], color=colour, linewidth=2, label=label)
+            plot.plot([], [], **line, linewidth=2, label=label)
         else:
-            plot.fill_between(mean.x / unit, mean.low, mean.high, color=colour, alpha=0.16, linewidth=0)
-            plot.plot(mean.x / unit, mean.mean, color=colour, linewidth=2, label=label)
+            plot.fill_between(mean.x / unit, mean.low, mean.high, color=line["color"], alpha=0.16, linewidth=0)
+            plot.plot(mean.x / unit, mean.mean, **line, linewidth=2, label=label)
     else:
-        plot.plot(getattr(runs[0], axis) / unit, runs[0].score, color=colour, linewidth=1.8, label=name)
+        plot.plot(getattr(runs[0], axis) / unit, runs[0].score, **line, linewidth=1.8, label=name)
 
 
 def draw_scores(intervals: Mapping[str, Mapping[str, Interval]], colours: Mapping[str, str]) -> Figure:

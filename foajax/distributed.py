@@ -116,19 +116,19 @@ def start(config: Config) -> Job:
     Raises:
       ConfigError: the others are not found, or the devices cannot share the environments.
     """
-    where = _where(config)
-    if where is not None:
+    others = where(config)
+    if others is not None:
         # Its handler of SIGTERM would replace ours, which saves.
         jax.config.update("jax_enable_preemption_service", False)
         keepalive = math.ceil(_KEEPALIVE * config.distributed.timeout)
         try:
             with mock.patch.object(_jax, "get_distributed_runtime_service", _Service):
                 jax.distributed.initialize(
-                    **where, initialization_timeout=_STARTING, heartbeat_timeout_seconds=keepalive
+                    **others, initialization_timeout=_STARTING, heartbeat_timeout_seconds=keepalive
                 )
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
-            raise ConfigError(f"distributed={where}: accepted is what all processes can reach ({reason})") from None
+            raise ConfigError(f"distributed={others}: accepted is what all processes can reach ({reason})") from None
     return Job(config)
 
 
@@ -149,7 +149,7 @@ class _Service:
         self._process.communicate("done")
 
 
-def _where(config: Config) -> dict[str, Any] | None:
+def where(config: Config) -> dict[str, Any] | None:
     """What `jax.distributed.initialize` has to be told; None for a process that is alone."""
     stated = config.distributed
     if stated.coordinator is not None:
@@ -261,7 +261,11 @@ class Watch:
             threading.Event().wait()  # the other thread ends the process
         place = f"process {self._job.index} of {self._job.count}"
         try:
-            said = f"foajax: error: {place}: another process died or hangs ({reason}); {self._rescue()}"
-            print(said, file=sys.stderr, flush=True)
+            try:
+                left = self._rescue()
+            except Exception as error:  # whatever it is, this process ends
+                left = f"nothing could be saved: {' '.join(str(error).split())}"
+            said = f"{place}: another process died or hangs ({reason}); {left}"
+            print(f"foajax: error: {said}", file=sys.stderr, flush=True)
         finally:
             os._exit(EXIT_CODE)  # an orderly end would wait for the others

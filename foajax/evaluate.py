@@ -42,8 +42,7 @@ class Options:
         for key in ("episodes", "num_envs"):
             if getattr(self, key) < 1:
                 raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
-        if self.json and not Path(self.json).absolute().parent.is_dir():
-            raise ConfigError(f"json={self.json}: accepted is a file in a directory that exists")
+        cli.check_file("json", self.json)
 
 
 class Games(NamedTuple):

@@ -6,9 +6,12 @@ speed at which the game is played: 15 decisions a second on Atari with its 60 fr
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import errno
 import importlib.util
 import itertools
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -47,7 +50,7 @@ class Options:
             if value is not None and value < 1:
                 raise ConfigError(f"{key}={value}: accepted is an integer >= 1")
         if self.format == "mp4" and not _has_ffmpeg():
-            raise ConfigError("format=mp4: accepted is gif where imageio-ffmpeg is missing (pip install foajax[video])")
+            raise ConfigError("format=mp4: accepted is gif where imageio-ffmpeg is missing (pip install -e '.[video]')")
 
 
 def play(stored: Stored, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
@@ -79,7 +82,8 @@ def _write_mp4(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.width}x{first.height}", "-r", f"{rate}", "-i", "-"]
     codec = ["-c:v", "libx264", "-preset", "veryfast", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *codec, str(file)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+    # A pipe that breaks is an ffmpeg that has ended, and its exit code tells.
+    with contextlib.suppress(BrokenPipeError), subprocess.Popen(command, stdin=subprocess.PIPE) as process:
         assert process.stdin is not None
         for frame in itertools.chain([first], frames):
             process.stdin.write(frame.tobytes())
@@ -103,6 +107,8 @@ def make_directory(out: str | Path) -> Path:
     """Creates the directory for results; one line where that cannot be."""
     try:
         Path(out).mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
         raise ConfigError(f"out={out}: accepted is a directory that can be written ({error.strerror})") from None
     return Path(out)

@@ -14,6 +14,7 @@ import html
 import io
 import os
 import sys
+import urllib.parse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +27,7 @@ from foajax.config import ConfigError, to_mapping
 from foajax.curves import RunData, read_run
 from foajax.heatmap import HeatMap
 from foajax.render import make_directory, play, progress_bar
-from foajax.rundir import flatten
+from foajax.rundir import FREE, flatten
 from foajax.scores import Interval, interval, iqm, normalised
 from foajax.store import load_agent
 
@@ -46,7 +47,7 @@ _PAPER_NAMES = {
     "constant70_p": "Constant(P) 70x70, sub2",
     "decreasing_p": "Decreasing(P) 30-50-70",
 }
-_NOT_COMPARED = ("seed", "run", "game", "name", "profile")
+_NOT_COMPARED = FREE | {"seed", "game", "name"}
 
 Groups = dict[str, list[RunData]]  # seeds of the same experiment, by the experiment's name
 
@@ -103,8 +104,7 @@ def _differences(runs: Sequence[RunData]) -> dict[str, list[Any]]:
     """The keys that matter to what is learned and do not have the same value in all runs."""
     flat = [dict(flatten(to_mapping(run.config))) for run in runs]
     keys = dict.fromkeys(key for each in flat for key in each)
-    ignored = (*_NOT_COMPARED, "train.", "env.threads")
-    values = {key: [each.get(key) for each in flat] for key in keys if not key.startswith(ignored)}
+    values = {key: [each.get(key) for each in flat] for key in keys if key not in _NOT_COMPARED}
     return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
 
 
@@ -267,10 +267,19 @@ def _add_runs(page: Page, runs: Sequence[RunData], directory: Path) -> None:
     rows = []
     for run in runs:
         files = sorted([*run.path.glob("render/episode-*"), *run.path.glob("player/*.html"), *run.path.glob("*.html")])
-        links = (f'<a href="{html.escape(os.path.relpath(f, directory))}">{html.escape(f.name)}</a>' for f in files)
+        names = {urllib.parse.quote(os.path.relpath(file, directory)): html.escape(file.name) for file in files}
+        links = (f'<a href="{reference}">{name}</a>' for reference, name in names.items())
         cells = [f"<code>{html.escape(str(run.path))}</code>", str(run.config.seed), f"{run.env_steps[-1]:,.0f}"]
-        rows.append([*cells, f"{run.final_score:.4g}", "evaluated" if run.evaluation else "training", " ".join(links)])
+        rows.append([*cells, f"{run.final_score:.4g}", _origin(run), " ".join(links)])
     page.table(["run", "seed", "env_steps", "score", "from", "to watch"], rows, numbers=(1, 2, 3))
+
+
+def _origin(run: RunData) -> str:
+    """Where the score is from; an evaluation may be of an earlier checkpoint."""
+    if run.evaluation is None:
+        return "training"
+    evaluated = run.evaluation.get("env_steps", run.env_steps[-1])
+    return "evaluated" if evaluated == run.env_steps[-1] else f"evaluated at {evaluated:,} env_steps"
 
 
 def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]:
@@ -303,12 +312,13 @@ def _file_name(name: str) -> str:
 
 def report(arguments: Sequence[str]) -> None:
     """The command; prints the path of the page."""
-    paths = [word for word in arguments if "=" not in word]
-    options = cli.parse(Options, [word for word in arguments if "=" in word])
+    # A sweep's directories may have "=" in their names.
+    paths = [word for word in arguments if "=" not in word or os.path.isdir(word)]
+    options = cli.parse(Options, [word for word in arguments if word not in paths])
     if not paths:
         raise ConfigError("no runs: accepted is report runs/<a> runs/<b> ... out=report")
     cost.wait_in_place()
-    games = games_of(map(read_run, dict.fromkeys(paths)), options.preset)
+    games = games_of(map(read_run, dict.fromkeys(map(Path, paths))), options.preset)
     print(build(games, find_maps(games, options.episodes), options))
 
 

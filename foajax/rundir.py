@@ -52,7 +52,7 @@ _BEFORE = {
     "learner": {"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step"},
 }
 # What may change between two starts of a run: none of it changes what a step learns.
-_FREE = {
+FREE = {
     *("run", "profile", "env.threads", "env.timeout"),
     *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep"),
     *("train.max_skipped", "train.dump_skipped"),
@@ -246,7 +246,7 @@ def check_same_run(path: Path, config: Config) -> None:
     """RunError where the run in `path` differs from `config` in a key that changes what is learned."""
     stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
     # With a falling learning rate the length of the run is part of what a step learns.
-    free = _FREE - {"train.env_steps"} if config.learner.schedule == "linear" else _FREE
+    free = FREE - {"train.env_steps"} if config.learner.schedule == "linear" else FREE
     keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
     if keys:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))

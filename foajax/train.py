@@ -124,8 +124,7 @@ class Run:
             self._watch.rest()
             self._finish()
         if not self._is_saved():
-            reason = f"{self._env_steps:,} env_steps were not saved, {self._newest():,} were"
-            raise ConfigError(f"run={self._config.run_dir}: {reason}; accepted is a directory that can be written")
+            raise ConfigError(self._unsaved())
         self._say(self._how_it_ends(stop.name or ("a signal to another process" if self._stop_agreed else None)))
 
     def _loop(self, stop: StopRequest) -> None:
@@ -305,15 +304,20 @@ class Run:
         except RuntimeError as error:  # a failed update has taken the arrays with it
             self._warn(f"nothing newer can be saved: {str(error).partition(chr(10))[0]}")
 
-    def _abandon(self, why: str, code: int) -> None:
-        """The watchdog's last words: the main thread does not come back."""
+    def _abandon(self, why: str, code: int) -> int:
+        """The watchdog's last words, and the exit code: the main thread does not come back."""
         self._finish()
         if code:
             report_fault(self._config, why, None)
-            if self._checkpoints is not None:
-                note_failure(Path(self._config.run_dir), why)
-        else:
+        elif self._is_saved():
             self._say(self._how_it_ends(why))
+            return code
+        else:
+            why, code = self._unsaved(), 2
+            self._say(f"foajax: error: {why}")
+        if self._checkpoints is not None:
+            note_failure(Path(self._config.run_dir), why)
+        return code
 
     def _how_it_starts(self) -> str:
         if not self._env_steps:
@@ -322,6 +326,10 @@ class Run:
             return f"new run of {self._config.name} on {self._config.game}{begins}"
         games = "episodes go on" if self._collector.resumable else "episodes start anew, emulators cannot be saved"
         return f"resumed at {self._env_steps:,} env_steps ({games})"
+
+    def _unsaved(self) -> str:
+        reason = f"it stands at {self._env_steps:,} env_steps, of which {self._newest():,} are saved"
+        return f"run={self._config.run_dir}: {reason}; accepted is a directory that can be written"
 
     def _how_it_ends(self, stop: str | None) -> str:
         if stop is None:
@@ -381,7 +389,7 @@ def train(config: Config) -> int:
 def _train(config: Config) -> None:
     with contextlib.ExitStack() as resources:
         if config.profile:
-            if config.train.devices > 1 or config.distributed.processes:
+            if config.train.devices > 1 or distributed.where(config):
                 raise ConfigError("profile=true: accepted is train.devices=1 and a single process")
             environments = make_environments(config, 0)
             for environment in environments:

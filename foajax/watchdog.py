@@ -53,8 +53,8 @@ class Watchdog:
       timeout: seconds that one call of an environment may take. Only seconds in which this process runs count:
         one that was stopped, or a machine that slept, is not taken for hung.
       abandon: called on the watching thread before the process exits, with what happened (the name of a signal,
-        or a line about the call) and the exit code; the main thread does nothing more then, and what it had
-        before the call is whole.
+        or a line about the call) and the exit code, which it may change by what it returns; the main thread does
+        nothing more then, and what it had before the call is whole.
       is_saved: whether there is nothing to lose.
       alone: whether it ends a process that does not answer a request to stop. One of several that stop together
         has to wait for them: its end would break what they are in.
@@ -64,7 +64,7 @@ class Watchdog:
         self,
         timeout: float,
         *,
-        abandon: Callable[[str, int], None],
+        abandon: Callable[[str, int], int],
         is_saved: Callable[[], bool],
         alone: bool = True,
     ) -> None:
@@ -147,7 +147,7 @@ class Watchdog:
             if self._call is not call or (call is None and not self._is_saved()) or self._closed:
                 return
             try:
-                self._abandon(why, code)
+                code = self._abandon(why, code)
             finally:
                 with contextlib.suppress(OSError, ValueError):
                     sys.stdout.flush()

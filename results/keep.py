@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,12 +40,18 @@ class Options:
 def keep(path: Path, name: str | None) -> Path:
     """Copies what matters of a run."""
     run = read_run(path)
-    if run.evaluation is None:
-        raise ConfigError(f"run={path}: score.json is missing; evaluate run={path} json={path}/score.json writes it")
+    wanted = {"env_steps": int(run.env_steps[-1]), "policy": "sampled", "episodes": 30}
+    found = {key: (run.evaluation or {}).get(key) for key in wanted}
+    if found != wanted:
+        command = f"evaluate run={path} json={path}/score.json"
+        raise ConfigError(f"run={path}: its score.json has {found}; accepted is {wanted}, as {command} writes it")
     config = dataclasses.replace(run.config, run=None)
     out = KEPT / (name or Path(config.run_dir).name)
+    text = yaml.safe_dump(to_mapping(config), sort_keys=False)
+    if out.exists() and (out / "config.yaml").read_text() != text:
+        raise ConfigError(f"name={out.name}: holds another run; accepted is another name=<game>-<name>-s<seed>")
     out.mkdir(parents=True, exist_ok=True)
-    (out / "config.yaml").write_text(yaml.safe_dump(to_mapping(config), sort_keys=False))
+    (out / "config.yaml").write_text(text)
     rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
     chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
     (out / "metrics.jsonl").write_text("".join(rows[i] for i in chosen))
@@ -55,15 +62,22 @@ def keep(path: Path, name: str | None) -> Path:
 
 def _facts(run: RunData) -> dict[str, Any]:
     starts = json.loads((run.path / "run.json").read_text())["starts"]
-    words = [word for word in starts[0]["command"] if "=" in word and not word.startswith("run=")]
+    # What a later start changes, such as train.env_steps, is part of what has to be repeated.
+    words = [word for word in starts[-1]["command"] if "=" in word and not word.startswith("run=")]
     return {
-        "command": " ".join(["python -m foajax.train", *words]),
+        "command": f"python -m foajax.train {shlex.join(words)}",
         "starts": [{"time": start["time"], "commit": start["commit"]} for start in starts],
         "seed": run.config.seed,
         "env_steps": int(run.env_steps[-1]),
         "hours": round(float(run.time[-1]) / 3600, 2),
         **{key: starts[-1][key] for key in _MACHINE},
     }
+
+
+def _named(run: RunData) -> RunData:
+    """Under the name that it is kept by: runs that other defaults made are not each other's seeds."""
+    name = run.path.name.removeprefix(f"{run.config.game}-").removesuffix(f"-s{run.config.seed}")
+    return run._replace(config=dataclasses.replace(run.config, name=name))
 
 
 def row(run: RunData) -> list[str]:
@@ -87,15 +101,16 @@ def main(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     if options.run is not None:
         print(keep(Path(options.run), options.name))
-    runs = sorted((read_run(path) for path in KEPT.iterdir() if path.is_dir()), key=lambda run: run.config.game)
+    runs = [_named(read_run(path)) for path in sorted(KEPT.iterdir()) if path.is_dir()]
     head = ["game", "experiment", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     lines = [head, ["---"] * len(head), *map(row, runs)]
     intro = (
-        "Score: mean and standard error over whole games, unclipped, sampled policy. Each `run.json` has the command, "
-        "with\nthe commit whose defaults it is meant for, and the machine. Made by `results/keep.py`."
+        "Score: mean and standard error over 30 whole games, unclipped, sampled policy, of the last checkpoint. Some\n"
+        "were stopped before their `train.env_steps`. Each `run.json` has the command, with the commit whose defaults\n"
+        "it is meant for, and the machine. Made by `results/keep.py`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    (KEPT / "README.md").write_text(f"# Finished runs\n{intro}\n\n{table}\n")
+    (KEPT / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n")
     for game, groups in games_of(runs, None).items():
         draw_curves(groups, game, colours_of(groups)).savefig(KEPT / f"{game}.png", dpi=110)
 

@@ -21,8 +21,8 @@
 
 # Before the time is up all processes are told to save (one would do: they stop together), and the job queues itself
 # again. Exit code 75 means that a process was lost and the others saved, one above 128 that it was a signal which took
-# it: the job goes on from there as well, 20 times at most: what takes it each time
-# has to be looked at.
+# it: the job goes on from there as well, unless it has been restarted 20 times (those at the time limit count too): what
+# takes it each time has to be looked at.
 trap 'again=1; kill -USR1 "$job"' USR1
 srun --kill-on-bad-exit=0 --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" \
   python -m foajax.train env.num_envs=256 env.threads="${SLURM_CPUS_PER_TASK:-1}" "$@" &

@@ -7,13 +7,12 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
+import processes
 import pytest
 
 from foajax import coordinator, distributed
@@ -41,9 +40,7 @@ TWENTY_UPDATES = 640  # env_steps
 
 def start(*words, **variables):
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
-    command = [sys.executable, "-m", "foajax.train", *WORDS, *words]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, env=environment | variables, text=True, **pipes)
+    return processes.start(*WORDS, *words, env=environment | variables)
 
 
 def start_job(count, *words, last=None):
@@ -55,10 +52,10 @@ def start_job(count, *words, last=None):
     return [start(*words, *where, f"distributed.process={i}", **variables[i]) for i in range(count)]
 
 
-def finish(*processes):
+def finish(*started):
     """Their output; all have to end well."""
-    outputs = [process.communicate(timeout=900) for process in processes]
-    for process, (_, err) in zip(processes, outputs, strict=True):
+    outputs = [process.communicate(timeout=900) for process in started]
+    for process, (_, err) in zip(started, outputs, strict=True):
         assert process.returncode == 0, err
     return [out for out, _ in outputs]
 
@@ -121,8 +118,8 @@ def test_what_two_processes_saved_one_goes_on_with_and_the_reverse(one, two):
 def lose_one(tmp_path, number, *, which):
     """Two endless processes, one of which gets a signal; the other's exit code and last words."""
     words = ["train.env_steps=100000000", "train.checkpoint_every=1000", "distributed.timeout=15"]
-    processes = start_job(2, f"run={tmp_path}", *words)
-    lost, left = processes[which], processes[1 - which]
+    started = start_job(2, f"run={tmp_path}", *words)
+    lost, left = started[which], started[1 - which]
     try:
         end = time.monotonic() + 900
         while not (tmp_path / "metrics.jsonl").exists() or len((tmp_path / "metrics.jsonl").read_text()) < 2000:
@@ -134,7 +131,7 @@ def lose_one(tmp_path, number, *, which):
         _, err = left.communicate(timeout=60)
         assert time.monotonic() - begin < 45
     finally:
-        for process in processes:
+        for process in started:
             process.kill()
         lost.communicate()
     return left.returncode, [line for line in err.splitlines() if line.startswith("foajax: error: ")]
@@ -193,13 +190,13 @@ def test_a_process_whose_environment_fails_says_so_and_the_others_save(tmp_path,
     tests = Path(__file__).parent
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tests.parent), str(tests)]))
     words = ["game=gymnasium:faulty:Faulty-v0", "env.timeout=5", "train.env_steps=1000", f"run={tmp_path / 'run'}"]
-    processes = start_job(2, *words, last={"FAULTY": fault})
+    started = start_job(2, *words, last={"FAULTY": fault})
     try:
-        errors = [process.communicate(timeout=90)[1] for process in processes]
+        errors = [process.communicate(timeout=90)[1] for process in started]
     finally:
-        for process in processes:
+        for process in started:
             process.kill()
-    assert [process.returncode for process in processes] == [75, 3], errors
+    assert [process.returncode for process in started] == [75, 3], errors
     (line,) = errors[0].splitlines()
     saved = load_agent(tmp_path / "run").env_steps
     assert "foajax: error: process 0 of 2: another process died or hangs (" in line
@@ -248,8 +245,8 @@ def test_a_signal_to_any_process_stops_all_and_saves(tmp_path):
 @pytest.mark.slow
 def test_a_directory_that_cannot_be_used_ends_all_in_one_line(tmp_path):
     (tmp_path / "file").write_text("")
-    processes = start_job(2, f"run={tmp_path / 'file'}")
-    for process in processes:
+    started = start_job(2, f"run={tmp_path / 'file'}")
+    for process in started:
         _, err = process.communicate(timeout=100)
         assert process.returncode == 2, err
         assert "is a file; accepted is a directory" in err

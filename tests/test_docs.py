@@ -13,6 +13,7 @@ BLOCKS = [
     for page in ("README.md", "docs/embedding.md")
     for i, block in enumerate(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL))
 ]
+SAID = re.compile(r"^(\S.*)  # ((?:Dict)?[(\[].*)$", re.MULTILINE)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -21,13 +22,13 @@ def test_a_block_of_code_runs_and_gives_what_it_says(block, monkeypatch):
     monkeypatch.chdir(ROOT)
     names: dict = {}
     exec(block, names)
-    said = re.findall(r"^(\S.*)  # ((?:Dict)?\(.*)$", block, re.MULTILINE)
-    for expression, value in said:
+    for expression, value in SAID.findall(block):
         assert str(eval(expression, names)) in (value, f"({value})")
 
 
-def test_there_are_blocks():
+def test_there_are_blocks_and_values():
     assert len(BLOCKS) == 4
+    assert sum(len(SAID.findall(str(block.values[0]))) for block in BLOCKS) == 4
 
 
 def test_links_lead_somewhere():

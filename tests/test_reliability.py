@@ -17,7 +17,7 @@ from processes import TINY, finish, newest, rows, start, wait_for
 from safetensors.numpy import load_file
 from test_checkpoint import Trap, damage_last_byte
 
-from foajax import durable
+from foajax import cli, durable, store
 from foajax.checkpoint import Checkpoints
 from foajax.store import load_agent
 
@@ -93,6 +93,9 @@ def test_the_best_so_far_is_kept_over_starts(run):
     assert after["games"] > before["games"] and after["best_score"] >= before["best_score"]
     left = Checkpoints(run / "checkpoints", keep=None).steps()
     assert left == [steps[0], 16000] and score(run, steps[0]) == 999.0
+    assert load_agent(run).env_steps == 16000 and load_agent(run, best=True).env_steps == steps[0]
+    assert cli.run(store.export, [f"run={run}", f"out={run}-best", "checkpoint=best"]) == 0
+    assert load_agent(f"{run}-best").env_steps == steps[0]
 
 
 def test_numbers_that_overflow_end_a_run_with_a_diagnosis_and_good_parameters(tmp_path):
@@ -151,4 +154,5 @@ def test_a_run_whose_end_is_not_saved_says_so(run):
     (run / "checkpoints" / ".12800.new").touch()
     code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=12800")
     assert code == 2 and "done" not in out, out
-    assert re.search(r"run=.*: 12,800 env_steps were not saved, 12,\d{3} were; accepted is a directory", err), err
+    said = r"run=.*: it stands at 12,800 env_steps, of which 12,\d{3} are saved; accepted is a directory"
+    assert re.search(said, err), err

@@ -13,7 +13,7 @@ from PIL import Image
 
 from foajax import cli, curves, heatmap, report
 from foajax.compose import compose
-from foajax.config import to_mapping
+from foajax.config import ConfigError, to_mapping
 from foajax.heatmap import HeatMap
 
 SMALL = ["network.dense=8", "network.lstm=8"]
@@ -121,6 +121,31 @@ def test_the_page_is_whole_in_a_browser(runs, tmp_path):
     with opened_page(tmp_path / "r" / "index.html") as page:
         assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 100)")
         assert page.locator("h2").all_inner_texts()[:3] == ["At a glance", "Learning curves", "Final scores"]
+
+
+def test_a_sweeps_directories_are_runs_and_twice_the_same_is_one(tmp_path, capsys):
+    run = make_run(tmp_path, "seek-small-learner.epochs=3-s0", words=["game=seek"], scores=[1.0, 2.0])
+    words = [str(run), f"{run}/", f"out={tmp_path / 'out'}", "episodes=0", "repeats=0"]
+    assert cli.run(report.report, words) == 0, capsys.readouterr().err
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "learner.epochs=3" in page and "2 seeds" not in page
+
+
+def test_an_evaluation_of_an_earlier_checkpoint_is_named(tmp_path):
+    run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0])
+    for env_steps, said in ((2000, "evaluated"), (1000, "evaluated at 1,000 env_steps")):
+        (run / "score.json").write_text(json.dumps({"mean": 1.5, "env_steps": env_steps}))
+        assert report._origin(curves.read_run(run)) == said
+
+
+def test_seeds_may_differ_in_what_does_not_matter_only(tmp_path):
+    alike = ["env.timeout=60", "train.env_steps=9000000"]
+    one = make_run(tmp_path, "one", words=["game=seek"], scores=[1.0])
+    two = make_run(tmp_path, "two", words=["game=seek", "seed=1", *alike], scores=[1.0])
+    other = make_run(tmp_path, "other", words=["game=seek", "seed=2", "train.init_from=agents/a"], scores=[1.0])
+    assert report.games_of(map(curves.read_run, (one, two)), None)
+    with pytest.raises(ConfigError, match="differs in train.init_from"):
+        report.games_of(map(curves.read_run, (one, other)), None)
 
 
 def test_runs_that_differ_need_names_that_differ(tmp_path):

@@ -31,6 +31,7 @@ module.GRACE = 1.0  # of 5
 
 def tell(why, code):
     print(f"abandoned: {why} ({code})")
+    return code
 
 signal.signal(signal.SIGTERM, lambda *_: print("heard", flush=True))
 with module.Watchdog(TIMEOUT, abandon=tell, is_saved=lambda: SAVED, alone=ALONE) as watchdog:
@@ -69,6 +70,7 @@ def test_work_outside_of_the_environments_may_take_its_time():
 
 def test_a_paused_process_is_not_taken_for_hung():
     process = script("sleep(4)", timeout=3.0)  # of which 3.5 s are paused
+    time.sleep(0.3)  # until it waits
     process.send_signal(signal.SIGSTOP)
     time.sleep(3.5)
     process.send_signal(signal.SIGCONT)
@@ -106,7 +108,7 @@ def test_an_error_is_named_and_passed_on():
         raise ValueError("no\nscreen")
 
     former = signal.set_wakeup_fd(-1)
-    with Watchdog(1000.0, abandon=lambda *_: None, is_saved=lambda: True) as watchdog:
+    with Watchdog(1000.0, abandon=lambda why, code: code, is_saved=lambda: True) as watchdog:
         with pytest.raises(EnvironmentFault, match="^group 0: recv raised ValueError: no screen$") as caught:
             watchdog.watched("group 0: recv", recv)(1)
         assert isinstance(caught.value.__cause__, ValueError)
