@@ -106,7 +106,8 @@ def draw_curves(groups: Mapping[str, Sequence[RunData]], title: str, colours: Ma
         plots[0].set_ylabel("score of a game, mean of the last 100")
         plots[0].set_title(title, loc="left", fontweight="bold")
         handles, labels = plots[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        columns = max(1, min(4, 140 // (max(map(len, labels)) + 6)))  # as many as the figure's width has room for
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns)
     return figure
 
 
