@@ -11,6 +11,7 @@ more open files or threads than at the beginning. Linux only; run it on an other
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import platform
@@ -29,6 +30,20 @@ from foajax import cli
 from foajax.config import ConfigError
 
 _EVERY = 1.0  # seconds between two looks
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command takes besides the keys of a run."""
+
+    minutes: float = 30.0
+    out: str | None = None
+    run: str | None = None  # directory; null for a temporary one
+
+    def __post_init__(self) -> None:
+        if self.minutes < 2:
+            raise ConfigError(f"minutes={self.minutes:g}: accepted is a number >= 2")
+        cli.check_file("out", self.out)
 
 
 class Sample(NamedTuple):
@@ -113,16 +128,13 @@ def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample]
 
 def main(words: Sequence[str]) -> int:
     """The command."""
-    ours = ("minutes=", "out=", "run=")
-    options = dict(word.split("=", 1) for word in words if word.startswith(ours))
-    minutes = options.get("minutes", "30")
-    if not minutes.replace(".", "", 1).isdecimal() or float(minutes) < 2:
-        raise ConfigError(f"minutes={minutes}: accepted is a number >= 2")
-    cli.check_file("out", options.get("out"))
-    seconds = 60 * float(minutes)
-    rest = [word for word in words if not word.startswith(ours)]
+    keys = [field.name for field in dataclasses.fields(Options)]
+    ours = [word for word in words if word.partition("=")[0] in keys]
+    options = cli.parse(Options, ours)
+    seconds = 60 * options.minutes
+    rest = [word for word in words if word not in ours]
     with tempfile.TemporaryDirectory() as directory:
-        samples, rows, code = train(rest, Path(options.get("run", f"{directory}/run")), seconds)
+        samples, rows, code = train(rest, Path(options.run or f"{directory}/run"), seconds)
     if code:
         return code
     result = verdict(samples, rows, seconds)
@@ -131,11 +143,11 @@ def main(words: Sequence[str]) -> int:
         print(f"{name:8} {begin:14.1f} {end:14.1f} {100 * (end / begin - 1):+7.2f} %")
     found = complaints(result)
     print("; ".join(found) or f"as it began, after {seconds / 60:g} minutes and {rows[-1]['env_steps']:,} env_steps")
-    if "out" in options:
+    if options.out:
         cores = len(os.sched_getaffinity(0))
         machine = {"machine": platform.platform(), "cores": cores, "jax": version("jax"), "words": rest}
         report = machine | {"seconds": seconds, "result": result, "samples": samples}
-        Path(options["out"]).write_text(json.dumps(report) + "\n")
+        Path(options.out).write_text(json.dumps(report) + "\n")
     return 1 if found else 0
 
 

@@ -14,10 +14,10 @@ import html
 import io
 import os
 import sys
-import urllib.parse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -267,8 +267,7 @@ def _add_runs(page: Page, runs: Sequence[RunData], directory: Path) -> None:
     rows = []
     for run in runs:
         files = sorted([*run.path.glob("render/episode-*"), *run.path.glob("player/*.html"), *run.path.glob("*.html")])
-        names = {urllib.parse.quote(os.path.relpath(file, directory)): html.escape(file.name) for file in files}
-        links = (f'<a href="{reference}">{name}</a>' for reference, name in names.items())
+        links = (f'<a href="{quote(os.path.relpath(f, directory))}">{html.escape(f.name)}</a>' for f in files)
         cells = [f"<code>{html.escape(str(run.path))}</code>", str(run.config.seed), f"{run.env_steps[-1]:,.0f}"]
         rows.append([*cells, f"{run.final_score:.4g}", _origin(run), " ".join(links)])
     page.table(["run", "seed", "env_steps", "score", "from", "to watch"], rows, numbers=(1, 2, 3))
