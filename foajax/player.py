@@ -102,10 +102,11 @@ def _columns(recording: Recording) -> dict[str, tuple[str, str]]:
         "focal_point": recording.focal_point.astype(np.int16),
         "natural_probs": np.round(255 * recording.natural_probs).astype(np.uint8),
         "natural_value": recording.natural_value.astype(np.float32),
-        "natural_action": recording.natural_action.astype(np.uint8),
+        "natural_action": recording.natural_action.astype(np.uint16),
         "vision_action": recording.vision_action.astype(np.uint8),
         "score": recording.score.astype(np.float32),
         "is_first": recording.is_first.astype(np.uint8),
+        "life_lost": recording.life_lost.astype(np.uint8),
     }
     if recording.vision_probs is not None and recording.vision_value is not None:
         columns["vision_probs"] = np.round(255 * recording.vision_probs).astype(np.uint8)

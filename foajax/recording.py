@@ -74,6 +74,13 @@ class Recording(NamedTuple):
     is_first: np.ndarray  # bool [N]: the learner's episode starts, with memory and gaze reset
 
     @property
+    def life_lost(self) -> np.ndarray:
+        """Bool [N]: the steps at which the game has a life fewer than before."""
+        if self.lives is None:
+            return np.zeros(len(self.score), bool)
+        return np.diff(self.lives, prepend=self.lives[0]) < 0
+
+    @property
     def frame_origin(self) -> tuple[float, float, float]:
         """Screen row at which the frame begins; screen pixels for a frame pixel, down and across."""
         height, width = self.config.env.frame_shape

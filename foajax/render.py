@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from foajax import cli, heatmap
 from foajax.config import ConfigError
@@ -41,7 +41,7 @@ class Options:
     policy: Literal["sampled", "greedy"] = "sampled"
     seed: int = 0  # of the first game; the next one has the next seed
     steps: int | None = None  # cuts a game after so many decisions; null for whole games
-    format: Literal["mp4", "gif"] | None = None  # null for mp4 where it can be written
+    format: Literal["mp4", "gif"] | None = None  # null for mp4 where it can be written; gif is for short games
     video: bool = True  # false for the heat map alone
 
     def __post_init__(self) -> None:
@@ -55,13 +55,14 @@ class Options:
 
 def play(stored: Stored, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
     """`recording.record`, with a bar for each game while it is played."""
+
+    def progress(steps: int, score: float) -> None:
+        bar.update(task, completed=steps, note=f"{steps:,} steps, score {score:g}")
+
+    games = record(stored, episodes=episodes, seed=seed, progress=progress, **how)
     for game in range(seed, seed + episodes):
         task = bar.add_task(f"game {game}", total=how["max_steps"], note="starts")
-
-        def progress(steps: int, score: float, task: TaskID = task) -> None:
-            bar.update(task, completed=steps, note=f"{steps:,} steps, score {score:g}")
-
-        yield from record(stored, seed=game, progress=progress, **how)
+        yield next(games)
         bar.update(task, total=bar.tasks[task].completed)
 
 
@@ -92,7 +93,10 @@ def _write_mp4(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
 
 
 def _write_gif(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
-    """A GIF's times are whole hundredths of a second: rounded so that they add up."""
+    """All pictures are in memory, twice: Pillow writes none before it has the last one (1.2 MB a step).
+
+    A GIF's times are whole hundredths of a second: rounded so that they add up.
+    """
     small = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
     ends = np.round(np.arange(1, len(small) + 1) * 100 / rate)
     durations = (10 * np.diff(ends, prepend=0)).astype(int).tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ _MARGIN = 16
 _TOP = 80  # of the pictures
 _TALL = 420  # of the screen
 _VIEW = 320  # of the sensor's view
+_HEADS = _TALL - 60  # of all their actions' rows
+_THINNEST = 9  # such a row
 _CHART = (960 - 2 * _MARGIN, 84)
 _PAPER, _PANEL, _INK, _FAINT = "#12161b", "#1b2128", "#e8edf2", "#8b98a5"
 _LOST, _REWARD = "#ff6b6b", "#ffd166"
@@ -40,6 +43,10 @@ class Scene:
         self._scale = _fit(recording.screens.shape[:2], (_TALL, _VIEW))
         self._chart = _chart(recording)
         self._still = self._background()
+        visual = 0 if recording.vision_probs is None else recording.vision_probs.shape[1]
+        likeliest = np.argsort(-recording.natural_probs.mean(axis=0), kind="stable")
+        self._natural = np.sort(likeliest[: _HEADS // _THINNEST - visual])  # all of them, if there is room
+        self._row = min(24, _HEADS // (len(self._natural) + visual))
 
     def draw(self, step: int) -> Image.Image:
         """The picture of a step, RGB."""
@@ -105,14 +112,17 @@ class Scene:
         return Image.fromarray((values.astype(np.uint16) * 255 // self._white).astype(np.uint8)).convert("RGB")
 
     def _draw_heads(self, image: Image.Image, step: int) -> None:
-        recording = self._recording
-        natural, vision = recording.natural_probs[step], recording.vision_probs
-        rows = len(natural) + (0 if vision is None else vision.shape[1])
-        height = min(24, (_TALL - 60) // rows)
-        top = _TOP - 16
-        top = self._draw_bars(image, top, height, "natural action", NATURAL, recording.actions, natural, step)
-        if vision is not None:
-            self._draw_bars(image, top, height, "visual action", VISION, NAMES, vision[step], step)
+        recording, some, top = self._recording, self._natural, _TOP - 16
+        names, probs = [recording.actions[i] for i in some], recording.natural_probs[step, some]
+        caption = "natural action"
+        if len(some) < len(recording.actions):
+            caption += f", the {len(some)} likeliest of {len(recording.actions)}"
+        chosen = some == recording.natural_action[step]
+        top = self._draw_bars(image, top, caption, NATURAL, names, probs, chosen)
+        if recording.vision_probs is not None:
+            probs = recording.vision_probs[step]
+            chosen = np.arange(len(probs)) == recording.vision_action[step]
+            self._draw_bars(image, top, "visual action", VISION, NAMES[: len(probs)], probs, chosen)
         else:
             note = f"gaze is not learned: {recording.config.gaze.mode}"
             ImageDraw.Draw(image).text((self._heads_left, top), note, fill=_FAINT, font=_font(12))
@@ -121,29 +131,27 @@ class Scene:
         self,
         image: Image.Image,
         top: int,
-        height: int,
         caption: str,
         colour: str,
-        names: tuple[str, ...],
+        names: Sequence[str],
         probs: np.ndarray,
-        step: int,
+        chosen: np.ndarray,
     ) -> int:
-        """One head's policy; the action taken is bright. Returns where the next one may begin."""
-        recording, pen = self._recording, ImageDraw.Draw(image)
-        chosen = (recording.natural_action if colour == NATURAL else recording.vision_action)[step]
+        """One head's policy, the chosen action (bool, by action) bright. Returns where the next one may begin."""
+        pen, height = ImageDraw.Draw(image), self._row
         left, right = self._heads_left, _SIZE[0] - _MARGIN
         pen.text((left, top), caption, fill=colour, font=_font(12))
         top += 18
         font = _font(max(8, min(12, height - 4)))
         start = left + 92
-        for i, (name, share) in enumerate(zip(names, probs, strict=False)):
+        for name, share, bright in zip(names, probs, chosen, strict=True):
             middle = top + height // 2
-            ink = _INK if i == chosen else _FAINT
+            ink = _INK if bright else _FAINT
             pen.text((start - 8, middle), name, fill=ink, font=font, anchor="rm")
             pen.rectangle([start, top + 2, right - 34, top + height - 3], fill=_PANEL)
             end = start + round(float(share) * (right - 34 - start))
             if end > start:
-                pen.rectangle([start, top + 2, end, top + height - 3], fill=colour if i == chosen else _dim(colour))
+                pen.rectangle([start, top + 2, end, top + height - 3], fill=colour if bright else _dim(colour))
             pen.text((right, middle), f"{100 * share:.0f}%", fill=ink, font=font, anchor="rm")
             top += height
         return top + 12
@@ -160,7 +168,9 @@ class Scene:
         legend = [(f"value of the natural head {recording.natural_value[step]:.2f}", NATURAL)]
         if recording.vision_value is not None:
             legend.append((f"of the vision head {recording.vision_value[step]:.2f}", VISION))
-        legend += [("points", _REWARD), ("a life lost", _LOST)]
+        legend.append(("points", _REWARD))
+        if recording.lives is not None:
+            legend.append(("a life lost", _LOST))
         left = _MARGIN
         for text, colour in legend:
             pen.text((left, _SIZE[1] - _MARGIN - _CHART[1] - 20), text, fill=colour, font=_font(12))
@@ -174,7 +184,7 @@ def _chart(recording: Recording) -> Image.Image:
     pen = ImageDraw.Draw(image)
     steps = len(recording.score)
     x = np.arange(steps) / max(steps - 1, 1) * (width - 1)
-    for i in np.flatnonzero(recording.is_first)[1:]:
+    for i in np.flatnonzero(recording.life_lost):
         pen.line([x[i], 0, x[i], height], fill=_LOST)
     for i in np.flatnonzero(np.diff(recording.score)) + 1:
         pen.line([x[i], height - 5, x[i], height], fill=_REWARD)

@@ -104,7 +104,7 @@ def keys_and_mouse_move_it(page, recording):
         page.keyboard.press(key)
         page.wait_for_function(f"document.body.dataset.shown === '{step}'")
     page.keyboard.press("]")
-    changes = np.flatnonzero((np.diff(recording.score) != 0) | recording.is_first[1:]) + 1
+    changes = np.flatnonzero((np.diff(recording.score) != 0) | recording.life_lost[1:]) + 1
     page.wait_for_function(f"document.body.dataset.shown === '{changes[0]}'")
     box = page.locator("#timeline").bounding_box()
     page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 20)

@@ -44,6 +44,8 @@ def test_the_focal_point_goes_where_the_visual_actions_send_it(recording):
 def test_lives_and_score_are_the_games(recording):
     assert recording.lives[0] == 5 and recording.lives[-1] < 5
     assert (np.diff(recording.lives) <= 0).all() and (np.diff(recording.score) >= 0).all()
+    np.testing.assert_array_equal(recording.life_lost[1:], np.diff(recording.lives) < 0)
+    assert not recording.life_lost[0] and not recording._replace(lives=None).life_lost.any()
     # The step after a lost life is the first one of the learner's next episode.
     np.testing.assert_array_equal(np.flatnonzero(np.diff(recording.lives)) + 2, np.flatnonzero(recording.is_first)[1:])
 

@@ -11,7 +11,7 @@ from foajax import cli, render
 from foajax.compose import compose
 from foajax.drawing import NATURAL, RINGS
 from foajax.recording import Screens
-from foajax.scene import _MARGIN, _TOP, Scene
+from foajax.scene import _MARGIN, _TOP, Scene, _dim
 from foajax.store import save_agent
 
 
@@ -30,6 +30,17 @@ def test_a_frame_shows_the_screen_the_gaze_and_the_view(recording):
     view = image[_TOP : _TOP + 320, 2 * _MARGIN + 320 : 2 * _MARGIN + 640]
     assert (view[..., 0] == view[..., 1]).all() and 0 < view.mean() < 250
     assert (image[:, 700:] == rgb(NATURAL)).all(axis=-1).sum() > 50  # the bar of the action taken
+
+
+def test_more_actions_than_fit_are_drawn_by_the_likeliest(recording):
+    probs = np.zeros((130, 300), np.float32)
+    probs[:, 299], probs[:, 0] = 0.75, 0.25
+    many = recording._replace(
+        natural_probs=probs, natural_action=np.full(130, 299), actions=tuple(f"action {i}" for i in range(300))
+    )
+    image = np.asarray(Scene(many).draw(9))[:, 700:]
+    bright, dim = ((image == rgb(colour)).all(axis=-1) for colour in (NATURAL, _dim(NATURAL)))
+    assert bright[120:, 140:].any() and dim[:120].any()  # the last one's bar, taken, and the first one's
 
 
 def test_a_whole_frame_without_a_gaze_of_its_own_is_drawn(recording):
