@@ -157,6 +157,7 @@ class NetworkConfig:
     torso: Literal["nature", "a3c"] = "nature"
     dense: int = 256  # units between torso and LSTM; 0 for none
     lstm: int = 256
+    padding: Literal["cover", "valid"] = "cover"  # of the nature torso; valid: strides leave out last rows and columns
     lstm_norm: bool = True  # layer norm of the input's part of the LSTM's gates
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 

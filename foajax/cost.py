@@ -141,7 +141,7 @@ def decision(
 
 def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ 1"], ...]) -> list[Array]:
     """The convolutions alone, of every image that is large enough for them."""
-    module: Any = networks.TORSOS[agent.config.network.torso]()
+    module: Any = networks.make_torso(agent.config.network)
     weights = {i: params["params"].get(f"torso_{i}") for i in range(len(roi))}
     return [module.apply({"params": own}, roi[i]) for i, own in weights.items() if own is not None]
 

@@ -39,15 +39,26 @@ class NatureTorso(nn.Module):
 
     A packed image is already subsampled, so below 44 pixels the first layer halves its kernel and stride: a
     unit then sees about the same patch of the frame as on the canvas. Layers that no longer fit are left out.
+    The strides fit the 84 pixels of that paper and leave out the last 4 rows and columns of 80, where Breakout has
+    its paddle: with `covers`, images and maps are padded with zeros until they fit.
     """
+
+    covers: bool = True
 
     @nn.compact
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
         first = (8, 4) if min(x.shape[1:3]) >= 44 else (4, 2)
         for features, (kernel, stride) in ((32, first), (64, (4, 2)), (64, (3, 1))):
             if min(x.shape[1:3]) >= kernel:
+                x = _pad_to_fit(x, kernel, stride) if self.covers else x
                 x = nn.relu(Convolution(features, kernel, stride)(x))
         return x.reshape(x.shape[0], -1)
+
+
+def _pad_to_fit(x: Float[Array, "N H W C"], kernel: int, stride: int) -> Float[Array, "N h w C"]:
+    """Zeros at the bottom and at the right, so that a convolution leaves nothing out."""
+    bottom, right = (-(size - kernel) % stride for size in x.shape[1:3])
+    return jnp.pad(x, ((0, 0), (0, bottom), (0, right), (0, 0)))
 
 
 class A3CTorso(nn.Module):
@@ -65,7 +76,13 @@ class A3CTorso(nn.Module):
         return x.reshape(x.shape[0], -1)
 
 
-TORSOS = {"nature": NatureTorso, "a3c": A3CTorso}
+def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
+    """The torso of one image."""
+    if config.torso == "a3c":
+        return A3CTorso(name=name)
+    return NatureTorso(covers=config.padding == "cover", name=name)
+
+
 _SMALLEST_IMAGE = 8  # below it (a 5x5 periphery) the values go straight to the next layer
 
 
@@ -114,9 +131,10 @@ class Network(nn.Module):
 
     def features(self, images: Sequence[Float[Array, "N _ _ _"]]) -> Float[Array, "N F"]:
         """What the torso makes of the sensor's images, concatenated; then the dense layer if there is one."""
-        torso = TORSOS[self.config.torso]
         parts = [
-            torso(name=f"torso_{i}")(x) if min(x.shape[1:3]) >= _SMALLEST_IMAGE else x.reshape(x.shape[0], -1)
+            make_torso(self.config, name=f"torso_{i}")(x)
+            if min(x.shape[1:3]) >= _SMALLEST_IMAGE
+            else x.reshape(x.shape[0], -1)
             for i, x in enumerate(images)
         ]
         features = jnp.concatenate(parts, axis=-1)

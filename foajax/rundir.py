@@ -48,7 +48,7 @@ _PACKAGES = (
 )
 # Keys that runs have not always had, and what was done before: older runs are read as they were made.
 _BEFORE = {
-    "network": {"lstm_norm": False},
+    "network": {"lstm_norm": False, "padding": "valid"},
     "learner": {"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step"},
 }
 # What may change between two starts of a run: none of it changes what a step learns.
