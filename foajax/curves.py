@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,19 +58,31 @@ def read_run(path: str | Path) -> RunData:
     """
     path = Path(path)
     config = load_config(path)
+    file = path / "metrics.jsonl"
     try:
-        rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-        rows = [(row["env_steps"], row["time"], row["score"]) for row in rows if row.get("score") is not None]
+        rows = _rows(file.read_bytes())
         file = path / "score.json"
         evaluation = json.loads(file.read_text()) if file.exists() else None
         if evaluation is not None:
             float(evaluation["mean"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"run={path}: its metrics.jsonl or score.json is not readable") from None
+        raise ConfigError(f"run={path}: its {file.name} is not readable") from None
     if not rows:
         raise ConfigError(f"run={path}: no game has ended in it yet; accepted is a run with scores")
     env_steps, time, score = np.array(rows, float).T
     return RunData(path, config, env_steps, time, score, evaluation)
+
+
+def _rows(content: bytes) -> list[tuple[float, float, float]]:
+    """env_steps, time and score of all rows that have a score; what is torn or no row is left out, as by the logger."""
+    rows = []
+    for line in content.splitlines():
+        with contextlib.suppress(ValueError, RecursionError, LookupError, TypeError, OverflowError):
+            row = json.loads(line)
+            values = float(row["env_steps"]), float(row["time"]), float(row["score"])
+            if all(map(math.isfinite, values)):
+                rows.append(values)
+    return rows
 
 
 def band(runs: Sequence[RunData], axis: str) -> Band | None:

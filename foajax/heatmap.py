@@ -36,6 +36,10 @@ class HeatMap:
     low: Int[np.ndarray, "2"]  # the smallest and the largest focal point (y, x) that the gaze may have
     high: Int[np.ndarray, "2"]
     games: int
+    # Whose gaze it is; None where a file is from before this was kept.
+    env_steps: int | None = None  # the agent had been trained for
+    policy: str | None = None  # "sampled" or "greedy"
+    whole_games: bool | None = None  # False where one was cut
 
     @property
     def steps(self) -> int:
@@ -68,6 +72,9 @@ class HeatMap:
         return {
             "steps": self.steps,
             "games": self.games,
+            "env_steps": self.env_steps,
+            "policy": self.policy,
+            "whole_games": self.whole_games,
             "entropy_bits": self.entropy,
             "share_at_bounds": self.share_at_bounds,
             "low": self.low.tolist(),
@@ -79,18 +86,22 @@ class HeatMap:
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> HeatMap:
         """The inverse of `to_json`."""
-        arrays = {key: np.array(record[key]) for key in ("counts", "mean_frame", "low", "high")}
-        return cls(games=record["games"], **arrays)
+        fields: dict[str, Any] = {key: np.array(record[key]) for key in ("counts", "mean_frame", "low", "high")}
+        fields |= {key: record.get(key) for key in ("env_steps", "policy", "whole_games")}
+        return cls(games=record["games"], **fields)
 
 
 def heat_map(recordings: Sequence[Recording]) -> HeatMap:
-    """Counts over whole games of one agent."""
-    config = recordings[0].config
+    """Counts over games of one agent."""
+    config, env_steps = recordings[0].config, recordings[0].env_steps
     lengths = [len(each.focal_point) for each in recordings]
     mean = np.average([each.mean_frame for each in recordings], axis=0, weights=lengths)
     points = np.concatenate([each.focal_point for each in recordings])
     low, high = bounds(config)
-    return HeatMap(count(points, config.env.frame_shape), mean, low, high, len(recordings))
+    policy = "greedy" if recordings[0].greedy else "sampled"
+    whole = all(each.is_over for each in recordings)
+    counts = count(points, config.env.frame_shape)
+    return HeatMap(counts, mean, low, high, len(recordings), env_steps, policy, whole)
 
 
 def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[np.ndarray, "H W"]:

@@ -2,8 +2,8 @@
 
 Learning curves, final scores, where the agents look, what they cost and how they differ. Runs of the same experiment
 on the same game are seeds of one another. Each figure is written as a PNG as well. What `render`, `player
-out=<run>/player` and `evaluate json=<run>/score.json` have left in a run's directory is taken up; a heat map that is
-not there yet is made, unless `episodes=0`.
+out=<run>/player` and `evaluate json=<run>/score.json` have left in a run's directory is taken up. A heat map that is
+not there, or not of whole games that the newest checkpoint played with sampled actions, is made, unless `episodes=0`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from foajax.heatmap import HeatMap
 from foajax.render import make_directory, play, progress_bar
 from foajax.rundir import FREE, flatten
 from foajax.scores import Interval, interval, iqm, normalised
+from foajax.status import newest_checkpoint
 from foajax.store import load_agent
 
 PAGE = "index.html"
@@ -60,7 +61,7 @@ class Options:
     preset: Literal["constant", "decreasing", "peripheral"] | None = (
         None  # only the experiments of a figure of the paper
     )
-    episodes: int = 3  # games for a heat map that is not there yet; 0 for none
+    episodes: int = 3  # games for a heat map that has to be made; 0 for none
     repeats: int = 50  # of each timing of a decision; 0 for no costs
 
     def __post_init__(self) -> None:
@@ -84,9 +85,11 @@ def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
         raise ConfigError(f"preset={preset}: accepted are runs of {', '.join(PRESETS[str(preset)])}")
     for groups in games.values():
         for name, seeds in groups.items():
-            if keys := _differences(seeds):
+            if differences := _differences(seeds):
+                key, values = next(iter(differences.items()))
+                other = next(run for run, value in zip(seeds, values, strict=True) if value != values[0])
                 raise ConfigError(
-                    f"{seeds[1].path}: {name} differs in {next(iter(keys))} from that of {seeds[0].path}; "
+                    f"{other.path}: {name} differs in {key} from that of {seeds[0].path}; "
                     "accepted are runs that differ in their seeds alone, or in their names"
                 )
     if preset is None:
@@ -122,6 +125,10 @@ def all_games(games: Mapping[str, Groups]) -> dict[str, Interval]:
         if len(known) == len(games) > 1:
             result[name] = interval(known, iqm)
     return result
+
+
+def _runs(games: Mapping[str, Groups]) -> list[RunData]:
+    return [run for groups in games.values() for seeds in groups.values() for run in seeds]
 
 
 def _experiments(games: Mapping[str, Groups]) -> list[str]:
@@ -178,7 +185,7 @@ def build(games: Mapping[str, Groups], maps: Mapping[Path, HeatMap], options: Op
     """Writes the page and its figures; returns the page's path."""
     directory = make_directory(options.out)
     page = Page(directory)
-    runs = [run for groups in games.values() for seeds in groups.values() for run in seeds]
+    runs = _runs(games)
     page.add(f"<h1>foajax: {options.preset or 'report'}</h1>")
     page.add(f'<p class="note">{_plural(len(runs), "run")} on {html.escape(", ".join(games))}.</p>')
     _add_summary(page, games, options.repeats)
@@ -278,7 +285,8 @@ def _origin(run: RunData) -> str:
     if run.evaluation is None:
         return "training"
     evaluated = run.evaluation.get("env_steps", run.env_steps[-1])
-    return "evaluated" if evaluated == run.env_steps[-1] else f"evaluated at {evaluated:,} env_steps"
+    where = "" if evaluated == run.env_steps[-1] else f" at {evaluated:,} env_steps"
+    return f"evaluated{where}{', greedy' if run.evaluation.get('policy') == 'greedy' else ''}"
 
 
 def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]:
@@ -286,19 +294,43 @@ def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]
     maps: dict[Path, HeatMap] = {}
     for groups in games.values():
         for seeds in groups.values():
-            found = {run.path: file for run in seeds if (file := run.path / "render" / heatmap.FILE).exists()}
-            maps |= {path: heatmap.read(file) for path, file in found.items()}
-            if not found and episodes and seeds[0].config.gaze.mode != "none":
-                maps[seeds[0].path] = _make_map(seeds[0], episodes)
+            first, found = seeds[0], {run.path: heat for run in seeds if (heat := _stored_map(run))}
+            if not found and episodes and first.config.gaze.mode != "none" and (heat := _make_map(first, episodes)):
+                found = {first.path: heat}
+            maps |= found
     return maps
 
 
-def _make_map(run: RunData, episodes: int) -> HeatMap:
+def _stored_map(run: RunData) -> HeatMap | None:
+    """The one in the run's directory, where a new one would be of the same agent and policy."""
+    file = run.path / "render" / heatmap.FILE
+    if not file.exists():
+        return None
+    heat = heatmap.read(file)
+    newest = newest_checkpoint(run.path) or int(run.env_steps[-1])  # a run may be kept without its checkpoints
+    if (heat.env_steps, heat.policy, heat.whole_games) == (newest, "sampled", True):
+        return heat
+    _note(f"{file}: left out, as it is not known to be of whole, sampled games at {newest:,} env_steps")
+    return None
+
+
+def _make_map(run: RunData, episodes: int) -> HeatMap | None:
+    """Of games played now; None where the run has nothing that could play."""
+    try:
+        stored = load_agent(run.path)
+    except ConfigError as error:
+        _note(f"no heat map: {error}")
+        return None
+    directory = make_directory(run.path / "render")
     with progress_bar() as bar:
-        games = play(load_agent(run.path), bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
+        games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
         heat = heatmap.heat_map([game._replace(images=()) for game in games])
-    heatmap.save(heat, make_directory(run.path / "render"), f"{run.config.name} on {run.config.game}")
+    heatmap.save(heat, directory, f"{run.config.name} on {run.config.game}")
     return heat
+
+
+def _note(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _plural(count: int, word: str) -> str:
@@ -317,7 +349,12 @@ def report(arguments: Sequence[str]) -> None:
     if not paths:
         raise ConfigError("no runs: accepted is report runs/<a> runs/<b> ... out=report")
     cost.wait_in_place()
-    games = games_of(map(read_run, dict.fromkeys(map(Path, paths))), options.preset)
+    runs = [read_run(path) for path in dict.fromkeys(map(Path, paths))]
+    games = games_of(runs, options.preset)
+    shown = {run.path for run in _runs(games)}
+    if others := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:
+        _note(f"preset={options.preset} leaves out {', '.join(others)}")
+    make_directory(options.out)  # before games are played for what could not be written
     print(build(games, find_maps(games, options.episodes), options))
 
 

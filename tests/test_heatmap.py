@@ -38,11 +38,29 @@ def test_a_gaze_that_never_moves_has_no_entropy():
 
 def test_one_of_a_recording(recording):
     heat = heatmap.heat_map([recording, recording])
-    assert heat.steps == 260 and heat.games == 2
+    assert heat.steps == 2 * len(recording.screens) and heat.games == 2
     for y, x in recording.focal_point[:10]:
         assert heat.counts[y, x] >= 2
     np.testing.assert_allclose(heat.mean_frame, recording.mean_frame, rtol=1e-6)
     assert heat.low.tolist() == [0, 0] and heat.high.tolist() == [79, 79]  # bounds=point
+
+
+def test_it_says_whose_gaze_it_is(recording):
+    def said(*recordings):
+        heat = HeatMap.from_json(heatmap.heat_map(recordings).to_json())
+        return heat.env_steps, heat.policy, heat.whole_games
+
+    cut, over = (recording._replace(is_over=is_over, env_steps=5) for is_over in (False, True))
+    assert said(over, over) == (5, "sampled", True)
+    assert said(over, cut) == (5, "sampled", False)
+    assert said(over._replace(greedy=True)) == (5, "greedy", True)
+
+
+def test_a_file_from_before_that_was_kept_does_not_say_it():
+    record = by_hand().to_json()
+    for key in ("env_steps", "policy", "whole_games"):
+        del record[key]
+    assert HeatMap.from_json(record).env_steps is None
 
 
 def test_the_files(tmp_path):

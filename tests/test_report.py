@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 
@@ -28,6 +29,18 @@ def make_run(directory, name, *, words, scores, step=1000, seconds=60.0):
     rows += [{"env_steps": step * i, "time": seconds * i, "score": s} for i, s in enumerate(scores, 1)]
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return run
+
+
+CURRENT = HeatMap(
+    *(np.eye(80, dtype=int), np.zeros((80, 80)), np.array([0, 0]), np.array([79, 79])),
+    **{"games": 4, "env_steps": 3000, "policy": "sampled", "whole_games": True},
+)
+
+
+def store_map(run, heat):
+    """As `render` does, without the picture."""
+    (run / "render").mkdir()
+    (run / "render" / heatmap.FILE).write_text(json.dumps(heat.to_json()))
 
 
 @pytest.fixture
@@ -76,6 +89,24 @@ def test_all_games_are_normalised_and_only_for_who_played_all(tmp_path):
     assert together["constant70"].value == pytest.approx((0.5 + 1) / 2)
 
 
+def test_torn_rows_and_what_is_no_row_are_left_out(tmp_path):
+    run = make_run(tmp_path, "killed", words=["game=seek"], scores=[1.0, 2.0])
+    no_rows = [b"", b"[1]", b"7", b"\xff", b'{"env_steps": 9, "time": NaN, "score": 1}', b'{"env_steps": 3000, "ti']
+    with (run / "metrics.jsonl").open("ab") as file:
+        file.write(b"\n".join(no_rows))
+    read = curves.read_run(run)
+    assert read.env_steps.tolist() == [1000, 2000] and read.score.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "score.json"])
+def test_the_file_that_is_not_readable_is_named(tmp_path, name):
+    run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0])
+    (run / name).unlink(missing_ok=True)
+    (run / name).mkdir()
+    with pytest.raises(ConfigError, match=f"run: its {name} is not readable"):
+        curves.read_run(run)
+
+
 def test_a_preset_has_the_papers_order_and_names(tmp_path):
     for name in ("constant70", "nonfoa", "decreasing", "constant50_sub1_packed"):
         make_run(tmp_path, name, words=["game=seek", f"experiment={name}"], scores=[1.0])
@@ -88,6 +119,15 @@ def test_a_preset_has_the_papers_order_and_names(tmp_path):
     assert list(report.games_of(every, "decreasing")["seek"]) == ["Constant 70x70, sub2", "Decreasing 30-50-70"]
 
 
+def test_what_a_preset_leaves_out_is_named(tmp_path, capsys):
+    names = ("constant70", "constant70-paper", "decreasing-gaze=frozen")
+    runs = [str(make_run(tmp_path, name, words=["game=seek", f"name='{name}'"], scores=[1.0])) for name in names]
+    words = [*runs, f"out={tmp_path / 'o'}", "preset=decreasing", "episodes=0", "repeats=0"]
+    assert cli.run(report.report, words) == 0
+    said = f"preset=decreasing leaves out {runs[1]} (constant70-paper), {runs[2]} (decreasing-gaze=frozen)\n"
+    assert capsys.readouterr().err == said
+
+
 def test_the_page(runs, tmp_path, capsys, monkeypatch):
     counted = {"pixels_actual": 625, "pixels_ratio": 0.0977, "torso_flops": 12e6, "decision_flops": 13e6}
     monkeypatch.setattr(
@@ -95,9 +135,7 @@ def test_the_page(runs, tmp_path, capsys, monkeypatch):
         "measure_decisions",
         lambda configs, repeats: [counted | {"decision_us_batch1": 950.0}] * len(configs),
     )
-    heat = HeatMap(np.eye(80, dtype=int), np.zeros((80, 80)), np.array([0, 0]), np.array([79, 79]), 4)
-    (runs[0] / "render").mkdir()
-    heatmap.save(heat, runs[0] / "render", "one")
+    store_map(runs[0], CURRENT)
     (runs[0] / "render" / "episode-0.mp4").write_bytes(b"")
     out = tmp_path / "report"
     words = [*map(str, runs), f"out={out}", "episodes=0", "repeats=1"]
@@ -138,6 +176,53 @@ def test_an_evaluation_of_an_earlier_checkpoint_is_named(tmp_path):
         assert report._origin(curves.read_run(run)) == said
 
 
+def test_greedy_games_are_named(tmp_path):
+    run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0])
+    for env_steps, said in ((2000, "evaluated, greedy"), (1000, "evaluated at 1,000 env_steps, greedy")):
+        (run / "score.json").write_text(json.dumps({"mean": 1.5, "env_steps": env_steps, "policy": "greedy"}))
+        assert report._origin(curves.read_run(run)) == said
+
+
+UNKNOWN = {"env_steps": None, "policy": None, "whole_games": None}  # from before it was kept
+
+
+@pytest.mark.parametrize(
+    "change, checkpoint, kept",
+    [
+        ({}, None, True),  # a run kept without its checkpoints
+        ({}, 3000, True),
+        ({"env_steps": 2500}, 2500, True),  # what is logged is further than what is saved
+        ({}, 4000, False),
+        ({"env_steps": 2000}, None, False),
+        ({"policy": "greedy"}, None, False),
+        ({"whole_games": False}, None, False),
+        (UNKNOWN, None, False),
+    ],
+)
+def test_a_heat_map_of_something_else_is_made_again(tmp_path, monkeypatch, change, checkpoint, kept):
+    run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0, 3.0])
+    store_map(run, dataclasses.replace(CURRENT, **change))
+    if checkpoint is not None:
+        (run / "checkpoints" / str(checkpoint)).mkdir(parents=True)
+    monkeypatch.setattr(report, "_make_map", lambda run, episodes: dataclasses.replace(CURRENT, games=episodes))
+    games = report.games_of([curves.read_run(run)], None)
+    assert report.find_maps(games, 9)[run].games == (4 if kept else 9)
+    assert (run in report.find_maps(games, 0)) == kept
+
+
+def test_a_run_that_cannot_play_has_no_heat_map(tmp_path, capsys):
+    run = make_run(tmp_path, "kept", words=["game=seek"], scores=[1.0])
+    assert report.find_maps(report.games_of([curves.read_run(run)], None), 1) == {}
+    assert capsys.readouterr().err.startswith(f"no heat map: run={run}: agent.json is missing")
+
+
+def test_no_game_is_played_for_a_page_that_cannot_be_written(tmp_path, monkeypatch, capsys):
+    run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0])
+    monkeypatch.setattr(report, "_make_map", lambda run, episodes: pytest.fail("played"))
+    assert cli.run(report.report, [str(run), f"out={run / 'config.yaml'}"]) == 2
+    assert "accepted is a directory that can be written" in capsys.readouterr().err
+
+
 def test_seeds_may_differ_in_what_does_not_matter_only(tmp_path):
     alike = ["env.timeout=60", "train.env_steps=9000000"]
     one = make_run(tmp_path, "one", words=["game=seek"], scores=[1.0])
@@ -151,8 +236,9 @@ def test_seeds_may_differ_in_what_does_not_matter_only(tmp_path):
 def test_runs_that_differ_need_names_that_differ(tmp_path):
     one = make_run(tmp_path, "a", words=["game=seek"], scores=[1.0])
     two = make_run(tmp_path, "b", words=["game=seek", "seed=1", "learner.learning_rate=2e-3"], scores=[1.0])
-    with pytest.raises(report.ConfigError, match="differs in learner.learning_rate from that of"):
-        report.games_of(map(curves.read_run, (one, two)), None)
+    same = make_run(tmp_path, "c", words=["game=seek", "seed=2"], scores=[1.0])
+    with pytest.raises(report.ConfigError, match=f"{two}: .* differs in learner.learning_rate from that of {one}"):
+        report.games_of(map(curves.read_run, (one, same, two)), None)
 
 
 @pytest.mark.parametrize(
