@@ -99,8 +99,8 @@ class GazeConfig:
     actions: Literal[5, 9] = 5  # stay, up, down, left, right; 9 adds the diagonals
     step: int = 4  # frame pixels a visual action moves
     bounds: Literal["window", "point"] = "window"  # what has to stay inside the frame
-    start: Literal["centre", "random"] | tuple[int, int] = "centre"  # at the start of an episode
-    path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn
+    start: Literal["centre", "random"] | tuple[int, int] = "centre"  # of an episode; moved within bounds
+    path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn, moved within bounds
 
     def __post_init__(self) -> None:
         _check(1 <= self.step <= 10_000, "gaze.step", self.step, "an integer from 1 to 10000")
@@ -158,6 +158,7 @@ class NetworkConfig:
     dense: int = 256  # units between torso and LSTM; 0 for none
     lstm: int = 256
     padding: Literal["cover", "valid"] = "cover"  # of the nature torso; valid: strides leave out last rows and columns
+    focal_point: Literal["always", "packed"] = "always"  # which gaze tells the LSTM where it is; packed: no canvas's
     lstm_norm: bool = True  # layer norm of the input's part of the LSTM's gates
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 

@@ -95,7 +95,7 @@ class Network(nn.Module):
     config: NetworkConfig
     num_natural_actions: int
     num_vision_actions: int  # 0: no vision head (non-FoA, and gaze that is not learned)
-    sees_focal_point: bool  # packed images do not tell where they were taken
+    sees_focal_point: bool
 
     @nn.compact
     def __call__(
@@ -159,12 +159,15 @@ def _gate_orthogonal(key: Array, shape: tuple[int, int]) -> Array:
 
 def make_network(config: Config, num_natural_actions: int) -> Network:
     """The network that an experiment asks for."""
-    packed = isinstance(config.sensor, RingSensor) and config.sensor.layout == "packed"
+    # A packed image does not tell where it was taken. Nor does a canvas whose normalisation makes 0 of what never
+    # changes, as of what is outside: between two rows of Breakout's empty middle it is the same.
+    canvas = isinstance(config.sensor, RingSensor) and config.sensor.layout == "canvas"
+    always = config.network.focal_point == "always" and config.gaze.mode != "none"
     return Network(
         config=config.network,
         num_natural_actions=num_natural_actions,
         num_vision_actions=config.gaze.actions if config.gaze.learned else 0,
-        sees_focal_point=packed or not isinstance(config.sensor, RingSensor),
+        sees_focal_point=always or not canvas,
     )
 
 

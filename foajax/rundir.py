@@ -48,7 +48,7 @@ _PACKAGES = (
 )
 # Keys that runs have not always had, and what was done before: older runs are read as they were made.
 _BEFORE = {
-    "network": {"lstm_norm": False, "padding": "valid"},
+    "network": {"lstm_norm": False, "padding": "valid", "focal_point": "packed"},
     "learner": {"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step"},
 }
 # What may change between two starts of a run: none of it changes what a step learns.
@@ -243,8 +243,13 @@ def _settle_config(path: Path, config: Config) -> None:
 
 
 def check_same_run(path: Path, config: Config) -> None:
-    """RunError where the run in `path` differs from `config` in a key that changes what is learned."""
+    """RunError where the run in `path` differs from `config` in a key that changes what is learned.
+
+    Where nothing was learned yet, because the run was refused, it may differ: the next words correct the last ones.
+    """
     stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
+    if not _has_begun(path):
+        return
     # With a falling learning rate the length of the run is part of what a step learns.
     free = FREE - {"train.env_steps"} if config.learner.schedule == "linear" else FREE
     keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
@@ -252,6 +257,12 @@ def check_same_run(path: Path, config: Config) -> None:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
         remedy = "choose another run=<dir> or restore the value"
         raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
+
+
+def _has_begun(path: Path) -> bool:
+    """Whether a row or a checkpoint is there."""
+    rows, checkpoints = path / "metrics.jsonl", path / "checkpoints"
+    return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -155,7 +155,13 @@ def test_learner_a2c_is_one_pass_without_clipping():
 
 
 def test_network_choices():
-    words = ["network.torso=a3c", "network.dense=0", "network.lstm=512", "network.lstm_norm=false"]
+    words = [
+        "network.torso=a3c",
+        "network.dense=0",
+        "network.lstm=512",
+        "network.focal_point=packed",
+        "network.lstm_norm=false",
+    ]
     words.append("network.normalization=running")
     assert compose(["network=a3c"]).network == compose(words).network
     assert compose(["network=nature"]) == composed()

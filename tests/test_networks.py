@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from foajax import compose
-from foajax.networks import initial_core_state, initial_params, make_network
+from foajax.config import NetworkConfig
+from foajax.networks import initial_core_state, initial_params, make_network, make_torso
 
 EXPERIMENTS = compose.list_experiments()
 
@@ -43,9 +44,43 @@ def test_every_experiment_has_four_outputs_or_two(experiment, torso):
         assert output.vision_logits is None and output.vision_value is None
 
 
-def test_only_a_canvas_tells_its_place_by_itself():
-    for experiment, sees in (("constant70", False), ("nonfoa", False), ("constant70_packed", True), ("logpolar", True)):
-        assert build(f"experiment={experiment}")[1].sees_focal_point == sees
+@pytest.mark.parametrize(
+    ("words", "sees"),
+    [
+        ("experiment=constant70", True),
+        ("experiment=constant70 gaze=frozen", True),
+        ("experiment=constant70 network.focal_point=packed", False),
+        ("experiment=constant70 network=a3c", False),
+        ("experiment=nonfoa", False),
+        ("experiment=constant70_packed network=a3c", True),
+        ("experiment=logpolar network=a3c", True),
+    ],
+)
+def test_a_gaze_that_moves_tells_where_it_is_but_not_the_papers_canvas(words, sees):
+    config, network, params = build(*words.split())
+    params, state = params(), initial_core_state(network, 2)
+    roi, focal_point, is_first = inputs(config, 3, 2)
+    apply = jax.jit(lambda point: network.apply(params, roi, point, is_first, state)[0].natural_value)
+    assert (np.abs(apply(focal_point) - apply(-focal_point)).max() > 1e-4) == sees
+
+
+@pytest.mark.parametrize("size", [80, 35, 30, 25, 18, 16])
+def test_the_nature_torso_leaves_out_no_pixel(size):
+    image = jax.random.normal(jax.random.key(0), (4, size, size, 1))
+    torso = make_torso(NetworkConfig())
+    features, params = torso.init_with_output(jax.random.key(1), image)
+    weights = jax.random.normal(jax.random.key(2), features.shape)
+    gradient = jax.grad(lambda x: (torso.apply(params, x) * weights).sum())(image)
+    assert (jnp.abs(gradient).sum(0) > 0).all()
+
+
+def test_what_strides_left_out_before():
+    """The last four rows and columns of 80: `padding=valid`, as older runs were made."""
+    image = jnp.ones((1, 80, 80, 1))
+    torso = make_torso(NetworkConfig(padding="valid"))
+    features, params = torso.init_with_output(jax.random.key(1), image)
+    assert features.shape == (1, 6 * 6 * 64)
+    np.testing.assert_array_equal(torso.apply(params, image.at[:, 76:].set(9.0).at[:, :, 76:].set(9.0)), features)
 
 
 def test_a_split_unroll_is_the_whole():

@@ -100,6 +100,8 @@ def test_a_shipped_agent_is_not_taken_for_a_run(config):
     ("group", "key", "before"),
     [
         ("network", "lstm_norm", False),
+        ("network", "padding", "valid"),
+        ("network", "focal_point", "packed"),
         ("learner", "full_rate_inputs", None),
         ("learner", "amsgrad", True),
         ("learner", "value_target", "n_step"),
@@ -146,6 +148,21 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
 # What may change between two starts
 
 
+def begun(config):
+    """Opens the run and lets it write a row."""
+    open_run(config, command=COMMAND).close()
+    (Path(config.run_dir) / "metrics.jsonl").write_text('{"env_steps": 640, "time": 1.0}\n')
+
+
+def test_what_was_refused_before_it_began_may_be_corrected(config):
+    open_run(changed(config, env__frame_shape=[84, 84]), command=COMMAND).close()
+    open_run(config, command=COMMAND).close()
+    assert load_config(config.run_dir) == config
+    checkpoint = Path(config.run_dir) / "checkpoints" / "640"
+    checkpoint.mkdir(parents=True)
+    assert refusal(changed(config, seed=3)).startswith("seed=3: the run in ")
+
+
 @pytest.mark.parametrize(
     ("key", "value", "line"),
     [
@@ -161,7 +178,7 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     ],
 )
 def test_another_meaning_is_refused_by_name(config, key, value, line):
-    open_run(config, command=COMMAND).close()
+    begun(config)
     before = {p.name: p.read_bytes() for p in Path(config.run_dir).iterdir()}
     told = refusal(changed(config, **{key: value}))
     assert told == line.format(run=config.run_dir) + "choose another run=<dir> or restore the value"
@@ -188,7 +205,7 @@ def test_what_means_the_same_is_taken_over(config):
 
 def test_the_length_of_a_run_counts_where_the_learning_rate_follows_it(config):
     linear = changed(config, learner__schedule="linear")
-    open_run(linear, command=COMMAND).close()
+    begun(linear)
     assert refusal(changed(linear, train__env_steps=7)).startswith("train.env_steps=7: the run in ")
 
 
