@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import os
 import sys
 import typing
 from collections.abc import Callable, Sequence
@@ -37,8 +38,21 @@ def parse(options: type[Options], arguments: Sequence[str]) -> Options:
 
 def check_file(key: str, path: str | None) -> None:
     """`ConfigError`, before anything long starts, where `path` is given and cannot be a file."""
-    if path is not None and (not Path(path).absolute().parent.is_dir() or Path(path).is_dir()):
-        raise ConfigError(f"{key}={path}: accepted is a file in a directory that exists")
+    if path is None:
+        return
+    file = Path(path).absolute()
+    if file.is_dir() or not file.parent.is_dir() or not os.access(file if file.exists() else file.parent, os.W_OK):
+        raise ConfigError(f"{key}={path}: accepted is a file, to write, in a directory that exists")
+
+
+def write_json(key: str, path: str, found: Any) -> None:
+    """Writes what a command has found; prints it, so that it is not lost, and raises `ConfigError` where that fails."""
+    text = json.dumps(found, indent=1) + "\n"
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        print(text)
+        raise ConfigError(f"{key}={path}: cannot be written ({error.strerror}); it is printed above") from None
 
 
 def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> int:

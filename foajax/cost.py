@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import math
 import os
 import platform
@@ -20,7 +19,6 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -229,7 +227,7 @@ def cost(arguments: Sequence[str]) -> None:
     records = measure(names, torso=options.torso, repeats=options.repeats)
     _print(records)
     if options.json:
-        Path(options.json).write_text(json.dumps(records, indent=1) + "\n")
+        cli.write_json("json", options.json, records)
 
 
 def _print(records: Sequence[dict[str, Any]]) -> None:

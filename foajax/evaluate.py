@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import jax
@@ -32,7 +30,7 @@ class Options:
 
     run: str  # a run directory or a shipped agent
     episodes: int = 30
-    policy: Literal["sampled", "greedy"] = "sampled"
+    policy: Literal["sampled", "greedy"] = "sampled"  # greedy games that begin alike are alike: 31 ways with no-ops
     checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     json: str | None = None  # file for the result
     num_envs: int = 30  # games played at once
@@ -129,7 +127,7 @@ def evaluate(arguments: Sequence[str]) -> None:
     }
     _print(result)
     if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
+        cli.write_json("json", options.json, result)
 
 
 def standard_error(returns: np.ndarray) -> float | None:

@@ -30,7 +30,10 @@ class GymnasiumEnvironment:
         name = config.game.removeprefix("gymnasium:")
 
         def make_one() -> gymnasium.Env:
-            env = gymnasium.make(name, render_mode="rgb_array" if render else None, disable_env_checker=True)
+            env = gymnasium.make(name, disable_env_checker=True)
+            if render and "rgb_array" in env.metadata.get("render_modes", ()):
+                env.close()
+                env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)
             return TimeLimit(env, config.env.max_episode_steps)  # beside a limit of its own
 
         try:
@@ -51,10 +54,10 @@ class GymnasiumEnvironment:
 
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins all episodes, from the seed."""
-        image, _ = self._env.reset(seed=self._seed)
+        self._image, _ = self._env.reset(seed=self._seed)
         zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
         self._ended = false
-        timestep = TimeStep(gray_frames(image, self.screen_shape), zeros, is_first=~false, is_terminal=false)
+        timestep = TimeStep(gray_frames(self._image, self.screen_shape), zeros, is_first=~false, is_terminal=false)
         return timestep, Outcome(score=zeros, is_over=false)
 
     def send(self, action: np.ndarray) -> None:
@@ -63,10 +66,10 @@ class GymnasiumEnvironment:
 
     def recv(self) -> tuple[TimeStep, Outcome]:
         """Steps every environment."""
-        image, score, terminated, truncated, _ = self._env.step(self._action)
+        self._image, score, terminated, truncated, _ = self._env.step(self._action)
         score = score.astype(np.float32)
         timestep = TimeStep(
-            frame=gray_frames(image, self.screen_shape),
+            frame=gray_frames(self._image, self.screen_shape),
             reward=np.sign(score) if self._clip else score,
             is_first=self._ended,
             is_terminal=terminated.copy(),
@@ -75,8 +78,11 @@ class GymnasiumEnvironment:
         return timestep, Outcome(score=score, is_over=self._ended)
 
     def render(self) -> np.ndarray:
-        """What the environments render, uint8 [B, h, w, 3]; of one made with `render`."""
-        return np.stack(self._env.render())
+        """What the environments render, uint8 [B, h, w, 3], of one made with `render`; else their images."""
+        if self._env.render_mode == "rgb_array":
+            return np.stack(self._env.render())
+        image = self._image if self._image.ndim == 4 else self._image[..., None]
+        return np.broadcast_to(image, (*image.shape[:3], 3))
 
     def close(self) -> None:
         """Closes every environment."""

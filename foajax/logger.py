@@ -169,7 +169,10 @@ class _MetricsFile:
 
 
 def _trim(path: Path, start_env_steps: int) -> float:
-    """Removes rows beyond `start_env_steps` and what is no row; the last row's ``time`` is returned."""
+    """Removes rows beyond `start_env_steps` and what is no row; the last row's ``time`` is returned.
+
+    Where nothing stays (a run whose checkpoints are gone starts anew), the rows are kept as ``metrics.old.jsonl``.
+    """
     content = path.read_bytes() if path.exists() else b""
     kept, seconds = [], 0.0
     for line in content.splitlines(keepends=True):
@@ -177,7 +180,9 @@ def _trim(path: Path, start_env_steps: int) -> float:
         if row is not None and row["env_steps"] <= start_env_steps:
             kept.append(line)
             seconds = float(row["time"])
-    if b"".join(kept) != content:
+    if content and not kept:
+        path.replace(path.with_name("metrics.old.jsonl"))
+    elif b"".join(kept) != content:
         durable.replace(path, b"".join(kept))
     return seconds
 

@@ -30,6 +30,8 @@ from foajax.recording import Recording, record
 from foajax.scene import Scene
 from foajax.store import Stored, load_agent
 
+_GIF_STEPS = 1000  # written at most: each takes 1.2 MB of memory
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -41,7 +43,7 @@ class Options:
     policy: Literal["sampled", "greedy"] = "sampled"
     seed: int = 0  # of the first game; the next one has the next seed
     steps: int | None = None  # cuts a game after so many decisions; null for whole games
-    format: Literal["mp4", "gif"] | None = None  # null for mp4 where it can be written; gif is for short games
+    format: Literal["mp4", "gif"] | None = None  # null for mp4 where it can be written
     video: bool = True  # false for the heat map alone
 
     def __post_init__(self) -> None:
@@ -67,11 +69,16 @@ def play(stored: Stored, bar: Progress, *, episodes: int = 1, seed: int, **how: 
 
 
 def write_video(recording: Recording, file: Path, bar: Progress) -> None:
-    """An mp4 or a GIF, by the name of the file."""
-    scene = Scene(recording)
-    task = bar.add_task(file.name, total=len(recording.screens), note="")
-    frames = (scene.draw(i) for i in range(len(recording.screens)))
-    write = _write_gif if file.suffix == ".gif" else _write_mp4
+    """An mp4, or the first minute or so as a GIF, by the name of the file."""
+    scene, steps, write = Scene(recording), len(recording.screens), _write_mp4
+    if file.suffix == ".gif":
+        write = _write_gif
+        if steps > _GIF_STEPS:
+            remedy = "whole games are for format=mp4 (pip install -e '.[video]')"
+            bar.console.print(f"{file}: the first {_GIF_STEPS:,} of {steps:,} steps; {remedy}")
+        steps = min(steps, _GIF_STEPS)
+    task = bar.add_task(file.name, total=steps, note="")
+    frames = (scene.draw(i) for i in range(steps))
     write(iter(bar.track(frames, task_id=task)), file, steps_per_second(recording.config))
 
 
@@ -93,7 +100,7 @@ def _write_mp4(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
 
 
 def _write_gif(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
-    """All pictures are in memory, twice: Pillow writes none before it has the last one (1.2 MB a step).
+    """All pictures are in memory, twice, because Pillow writes none before it has the last one.
 
     A GIF's times are whole hundredths of a second: rounded so that they add up.
     """

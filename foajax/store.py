@@ -23,9 +23,9 @@ from safetensors.numpy import load_file, save_file
 from foajax import cli, durable
 from foajax.agent import Agent
 from foajax.checkpoint import Checkpoints
-from foajax.config import ConfigError, to_mapping
+from foajax.config import Config, ConfigError, to_mapping
 from foajax.programs import make_state
-from foajax.rundir import PARAMETERS, is_run, load_config
+from foajax.rundir import PARAMETERS, flatten, is_run, load_config
 from foajax.types import FrameStatistics, Params, TrainState
 
 _FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
@@ -79,7 +79,7 @@ def load_agent(path: str | Path, *, best: bool = False) -> Stored:
     return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
 
 
-def begin_from(path: str, state: TrainState) -> TrainState:
+def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
     """The state at the start of a run, with a stored agent's parameters and frame statistics.
 
     Raises:
@@ -94,10 +94,20 @@ def begin_from(path: str, state: TrainState) -> TrainState:
     for name in [*wanted, *there]:
         have, want = (arrays[name].shape if name in arrays else None for arrays in (there, wanted))
         if have != want:
-            accepted = "an agent with this run's sensor, network, gaze and number of actions"
+            accepted = (
+                f"an agent with this run's sensor, network, gaze and number of actions; {_differences(stored, config)}"
+            )
             raise ConfigError(f"{key}: {name} has the shape {have}, here it is {want}; accepted is {accepted}")
     params, statistics = jax.tree.map(jnp.asarray, (stored.params, stored.statistics))
     return state._replace(params=params, statistics=statistics)
+
+
+def _differences(stored: Stored, config: Config) -> str:
+    """What of another configuration may be why an agent's parameters do not fit it."""
+    there, here = (dict(flatten(to_mapping(c))) for c in (stored.agent.config, config))
+    groups = ("sensor", "network", "gaze")
+    differ = [key for key in there if key.startswith(groups) and here.get(key) != there[key]]
+    return "that one has " + (", ".join(f"{key}={there[key]}" for key in differ) or "other actions")
 
 
 def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None = None) -> None:

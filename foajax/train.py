@@ -78,7 +78,7 @@ class Run:
         self._tracker = EpisodeTracker(config.env.num_envs)
         state = make_state(agent, config.seed)
         if config.train.init_from is not None and not self._env_steps:
-            state = begin_from(config.train.init_from, state)
+            state = begin_from(config.train.init_from, state, config)
         self._state = self._on_all_devices(state)
         self._stop_agreed = False
         self._kept: tuple[int, dict[str, Any], dict[str, Any]] | None = None
@@ -95,7 +95,7 @@ class Run:
                 run_dir.path,
                 total_env_steps=config.train.env_steps,
                 start_env_steps=self._env_steps,
-                frame_skip=config.env.frame_skip,
+                frame_skip=config.env.frame_skip if envs.is_atari(config) else 1,
             )
         )
         resources.enter_context(self._checkpoints)
@@ -206,7 +206,8 @@ class Run:
             return
         if self._dump:
             self._dump.look(metrics)
-        last, most = metrics[-1], self._config.train.max_skipped
+        most = self._config.train.max_skipped
+        last = max(metrics, key=lambda each: int(each["skipped_in_a_row"]))
         if int(last["skipped_in_a_row"]) >= most:
             self._log(metrics)
             values = ", ".join(f"{name} {float(last[name]):.4g}" for name in ("loss", "grad_norm", "param_norm"))
@@ -387,6 +388,10 @@ def train(config: Config) -> int:
 
 
 def _train(config: Config) -> None:
+    window, frame = config.sensor.window, config.env.frame_shape
+    if config.gaze.mode == "none" and window != frame:
+        area = f"of {window[0]}x{window[1]} in a frame of {frame[0]}x{frame[1]}"
+        raise ConfigError(f"gaze.mode=none: accepted is learned, frozen, random or scripted for a focal area {area}")
     with contextlib.ExitStack() as resources:
         if config.profile:
             if config.train.devices > 1 or distributed.where(config):

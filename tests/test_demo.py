@@ -107,7 +107,7 @@ def test_agents_are_beside_a_checkout():
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("json=nowhere/score.json", "json=nowhere/score.json: accepted is a file in a directory that exists"),
+        ("json=nowhere/score.json", "json=nowhere/score.json: accepted is a file, to write, in a directory that"),
         ("seed=2147483647", "seed=2147483647: accepted is an integer from 0 to"),
         ("seed=-1", "seed=-1: accepted is an integer from 0 to"),
         ("checkpoint=last", "checkpoint=last: accepted is one of newest, best"),

@@ -469,6 +469,33 @@ def test_gymnasium_renders(pixels):
     environment.close()
 
 
+class Bare(Pixels):
+    """Knows nothing of rendering."""
+
+    metadata: dict = {}
+
+    def __init__(self, shape):
+        super().__init__(shape)
+
+    def render(self):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("shape", [(160, 240, 3), (80, 80, 1), (80, 80)])
+def test_gymnasium_without_rendering_shows_its_images(shape):
+    gymnasium.register("Bare-v0", entry_point=Bare, kwargs={"shape": shape})
+    try:
+        environment = envs.make(config("gymnasium:Bare-v0"), num_envs=2, seed=0, render=True)
+    finally:
+        del gymnasium.registry["Bare-v0"]
+    environment.reset()
+    screens = environment.render()
+    assert screens.shape == (2, *shape[:2], 3) and screens.dtype == np.uint8
+    reference = Pixels(shape)
+    reference.count = 0
+    np.testing.assert_array_equal(screens[1], reference.image().reshape(*shape[:2], -1) + np.zeros(3, np.uint8))
+
+
 @pytest.mark.parametrize(("source", "target"), [(160, 80), (210, 80), (96, 80), (50, 80), (80, 80)])
 def test_area_weights_are_the_covered_shares(source, target):
     weights = gymnasium_env.area_weights(source, target)

@@ -129,6 +129,14 @@ def test_a_start_keeps_whole_rows_up_to_it(tmp_path, content, kept):
     assert sorted(os.listdir(tmp_path)) == ["metrics.jsonl", "tensorboard"]
 
 
+def test_a_start_without_checkpoints_keeps_the_rows_of_the_last_one(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text("".join(WHOLE))
+    with start(tmp_path, 0) as log:
+        log.write({"env_steps": 50})
+    assert [row["env_steps"] for row in rows(tmp_path)] == [50]
+    assert (tmp_path / "metrics.old.jsonl").read_text() == "".join(WHOLE)
+
+
 def test_a_file_that_cannot_be_opened_is_an_error_at_the_start(tmp_path):
     (tmp_path / "metrics.jsonl").mkdir()
     with pytest.raises(OSError, match=r"metrics\.jsonl"):

@@ -68,9 +68,10 @@ def test_the_command_writes_an_mp4_at_the_games_speed(breakout_agent, tmp_path, 
     assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (30, 15)
 
 
-def test_a_gif_has_the_same_speed(recording, tmp_path):
+def test_a_gif_has_the_same_speed(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(render, "_GIF_STEPS", 20)
     first = Screens()
-    for screen in recording.screens[:20]:
+    for screen in recording.screens[:24]:
         first.append(screen)
     with render.progress_bar() as bar:
         render.write_video(recording._replace(screens=first), tmp_path / "game.gif", bar)
@@ -80,6 +81,7 @@ def test_a_gif_has_the_same_speed(recording, tmp_path):
             image.seek(i)
             durations.append(image.info["duration"])
     assert sum(durations) == pytest.approx(1000 * 20 / 15, abs=10)
+    assert "the first 20 of 24 steps" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

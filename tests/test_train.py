@@ -122,7 +122,7 @@ def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path):
         (
             "breakout",
             "network.lstm=8",
-            "accepted is an agent with this run's sensor, network, gaze and number of actions",
+            "this run's sensor, network, gaze and number of actions; that one has network.lstm=16\n",
         ),
     ],
 )
@@ -179,6 +179,7 @@ def test_two_processes_do_not_share_a_run(tmp_path):
         ("env.num_envs=many", "env.num_envs=many: accepted is an integer"),
         ("game=no_such_game", "game=no_such_game: accepted is"),
         ("experiment=constant71", "experiment=constant71: accepted is one of"),
+        ("gaze=none", "gaze.mode=none: accepted is learned, frozen, random or scripted for a focal area of 16x16"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, word, said):
