@@ -14,6 +14,8 @@ processes (gloo on the loopback address), by the number of parameters. Medians.
 
 `model`: what bounds bigger machines, from `Assumptions`, each of which says where it comes from.
 
+Where there are no two cores to pin processes to (macOS pins none), `weak` and `allreduce` are left out.
+
 Run it on an idle machine.
 """
 
@@ -34,10 +36,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from foajax import cli
+from foajax import cli, envs
+from foajax.compose import compose
+from foajax.config import ConfigError
 
 SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32
 DEVICES = (2, 4, 8)
+MINIBATCHES = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +60,8 @@ class Options:
     process: int = 0
 
     def __post_init__(self) -> None:
+        if self.envs < 1 or self.envs % MINIBATCHES:
+            raise ConfigError(f"envs={self.envs}: accepted is a multiple of {MINIBATCHES}")
         cli.check_file("out", self.out)
 
 
@@ -77,6 +84,11 @@ class Assumptions:
     delay: float = 20e-6  # of a message between hosts: assumed
 
 
+def pinnable() -> list[int]:
+    """This process's cores; none where a system cannot say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
 def start(
     arguments: Sequence[str], *, core: int | None = None, out: IO[str] | int = subprocess.PIPE, **variables: str
 ) -> subprocess.Popen:
@@ -97,12 +109,12 @@ def free_address() -> str:
 def training(options: Options, run: Path, processes: int, process: int, address: str) -> list[str]:
     """The words of one process of a run: equal work for each process, whatever their number."""
     words = [f"game={options.game}", f"experiment={options.experiment}", f"run={run}", "env.threads=1"]
-    words += [f"env.num_envs={options.envs * processes}", "learner=a2c", "learner.minibatches=4", "train.log_every=0.5"]
-    words += ["train.env_steps=100000000", "train.checkpoint_every=1000"]
+    words += [f"env.num_envs={options.envs * processes}", "learner=a2c", f"learner.minibatches={MINIBATCHES}"]
+    words += ["train.log_every=0.5", "train.env_steps=100000000", "train.checkpoint_every=1000"]
     if processes > 1:
         shared = {"coordinator": address, "processes": processes, "process": process}
         words += [f"distributed.{key}={value}" for key, value in shared.items()]
-    return ["-m", "foajax.train", *words]
+    return words
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
@@ -117,7 +129,8 @@ def speed(run: Path, processes: Sequence[subprocess.Popen], seconds: float) -> f
         while len(logged := rows(run)) < 4 or logged[-1]["time"] - logged[2]["time"] < seconds:
             for process in processes:
                 if process.poll() is not None:
-                    raise RuntimeError(f"{process.args} ended; its output is above")
+                    ended = f"foajax.train ended with exit code {process.returncode}, its output is above"
+                    raise ConfigError(f"part=weak: {ended}; accepted is what it can train")
             time.sleep(0.2)
     finally:
         for process in processes:
@@ -127,8 +140,11 @@ def speed(run: Path, processes: Sequence[subprocess.Popen], seconds: float) -> f
     return (last["env_steps"] - first["env_steps"]) / (last["time"] - first["time"])
 
 
-def weak(options: Options) -> dict[str, Any]:
+def weak(options: Options, cores: Sequence[int]) -> dict[str, Any]:
     """Speeds of one process, of two that share a run, and of two runs at a time."""
+    # What training would refuse is said once, and here.
+    config = compose(training(options, Path("run"), 1, 0, ""))
+    envs.make(config, num_envs=1, seed=0).close()
     with tempfile.TemporaryDirectory() as temporary:
         directory = Path(temporary)
 
@@ -137,7 +153,10 @@ def weak(options: Options) -> dict[str, Any]:
             words = [training(options, directory / name, processes, i, address) for i in range(processes)]
             words += [training(options, directory / f"{name}-beside", 1, 0, "")] * beside
             # A pipe that nobody reads would be full one day.
-            started = [start(w, core=core, out=sys.stderr) for core, w in enumerate(words)]
+            started = [
+                start(["-m", "foajax.train", *w], core=core, out=sys.stderr)
+                for core, w in zip(cores, words, strict=False)
+            ]
             return speed(directory / name, started, options.seconds)
 
         one = measure("one", 1)
@@ -152,16 +171,26 @@ def weak(options: Options) -> dict[str, Any]:
     }
 
 
-def allreduce() -> dict[str, Any]:
+def allreduce(cores: Sequence[int]) -> dict[str, Any]:
     """Microseconds of a sum, by devices and parameters."""
     found: dict[str, Any] = {}
     for devices in DEVICES:
         process = start([__file__, "part=member", f"devices={devices}"], JAX_NUM_CPU_DEVICES=str(devices))
-        found[f"{devices} virtual devices"] = json.loads(process.communicate()[0].splitlines()[-1])
+        found[f"{devices} virtual devices"] = answer(process)
     address = free_address()
-    members = [start([__file__, "part=member", f"coordinator={address}", f"process={i}"], core=i) for i in (0, 1)]
-    found["2 processes"] = [json.loads(m.communicate()[0].splitlines()[-1]) for m in members][0]
+    words = [[__file__, "part=member", f"coordinator={address}", f"process={i}"] for i in (0, 1)]
+    members = [start(w, core=core) for core, w in zip(cores, words, strict=True)]
+    found["2 processes"] = [answer(m) for m in members][0]
     return found
+
+
+def answer(process: subprocess.Popen) -> dict[str, float]:
+    """What a process of `allreduce` has found."""
+    lines = process.communicate()[0].splitlines() or [""]
+    if process.returncode:
+        ended = f"a process ended with exit code {process.returncode}"
+        raise ConfigError(f"part=allreduce: {ended} ({lines[-1]}); accepted is a machine on which it can run")
+    return json.loads(lines[-1])
 
 
 def member(options: Options) -> dict[str, float]:
@@ -235,12 +264,19 @@ def main(arguments: Sequence[str]) -> None:
         return
     import jaxlib
 
-    versions = {"python": platform.python_version(), "jax": jaxlib.__version__, "cores": len(os.sched_getaffinity(0))}
+    versions = {
+        "python": platform.python_version(),
+        "jax": jaxlib.__version__,
+        "cores": len(pinnable()) or os.cpu_count(),
+    }
     result: dict[str, Any] = {"options": dataclasses.asdict(options), **versions}
-    if options.part in ("all", "weak"):
-        result["env_steps a second"] = weak(options)
-    if options.part in ("all", "allreduce"):
-        result["microseconds by parameters"] = allreduce()
+    cores = pinnable()[:2]
+    if len(cores) < 2 and options.part != "model":
+        print("left out: weak and allreduce, which need two cores to pin processes to", file=sys.stderr)
+    if len(cores) == 2 and options.part in ("all", "weak"):
+        result["env_steps a second"] = weak(options, cores)
+    if len(cores) == 2 and options.part in ("all", "allreduce"):
+        result["microseconds by parameters"] = allreduce(cores)
     if options.part in ("all", "model"):
         result["model"] = model()
     text = json.dumps(result, indent=1)

@@ -74,8 +74,18 @@ def verdict(samples: Sequence[Sample], rows: Sequence[dict], seconds: float) -> 
       samples: in order.
       rows: of `metrics.jsonl`; their `time` is the run's own.
       seconds: how long the run was to last.
+
+    Raises:
+      ConfigError: too few rows to tell a speed from.
     """
-    settled, window, end = seconds / 6, seconds / 30, samples[-1].time
+    settled, window = seconds / 6, seconds / 30
+    times = [row["time"] for row in rows] or [0.0]
+    early = [row for row in rows if times[0] + settled <= row["time"] <= times[0] + 2 * settled]
+    late = [row for row in rows if row["time"] >= times[-1] - settled]
+    if min(len(early), len(late)) < 2:
+        accepted = f"enough for two rows of metrics.jsonl in each sixth of them (in all there are {len(rows)})"
+        raise ConfigError(f"minutes={seconds / 60:g}: accepted is {accepted}")
+    end = samples[-1].time
     first = [s for s in samples if settled <= s.time < settled + window]
     last = [s for s in samples if s.time >= end - window]
     result = {}
@@ -85,9 +95,7 @@ def verdict(samples: Sequence[Sample], rows: Sequence[dict], seconds: float) -> 
         result[f"{name}_begin"], result[f"{name}_end"] = (
             pick(getattr(s, name) for s in part) for part in (first, last)
         )
-    times = [row["time"] for row in rows]
-    result["speed_begin"] = _speed([row for row in rows if times[0] + settled <= row["time"] <= times[0] + 2 * settled])
-    result["speed_end"] = _speed([row for row in rows if row["time"] >= times[-1] - settled])
+    result["speed_begin"], result["speed_end"] = _speed(early), _speed(late)
     return result
 
 
@@ -110,20 +118,20 @@ def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample]
     """Trains for `seconds`; returns the samples, the rows of metrics and the exit code."""
     command = [sys.executable, "-m", "foajax.train", *words, f"run={run}", "train.env_steps=2000000000"]
     file = run / "metrics.jsonl"
-    before = len(file.read_text().splitlines()) if file.exists() else 0
+    before = len(_lines(file))
     begin = time.monotonic()
-    with (run.parent / "log").open("w") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
+    with tempfile.TemporaryFile("w+") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
         samples = []
         while time.monotonic() - begin < seconds and process.poll() is None:
             time.sleep(_EVERY)
             if process.poll() is None:
                 samples.append(sample(process.pid, begin))
         process.send_signal(signal.SIGTERM)
-        code = process.wait()
-    if code:
-        print((run.parent / "log").read_text(), file=sys.stderr)
-        return samples, [], code
-    return samples, [json.loads(line) for line in file.read_text().splitlines()[before:]], 0
+        if code := process.wait():
+            log.seek(0)
+            print(log.read(), end="", file=sys.stderr)
+            return samples, [], code
+    return samples, [json.loads(line) for line in _lines(file)[before:]], 0
 
 
 def main(words: Sequence[str]) -> int:
@@ -149,6 +157,11 @@ def main(words: Sequence[str]) -> int:
         report = machine | {"seconds": seconds, "result": result, "samples": samples}
         Path(options.out).write_text(json.dumps(report) + "\n")
     return 1 if found else 0
+
+
+def _lines(file: Path) -> list[str]:
+    """What a run has logged; nothing before its first row."""
+    return file.read_text().splitlines() if file.exists() else []
 
 
 def _speed(rows: Sequence[dict]) -> float:

@@ -184,6 +184,11 @@ def main(arguments: Sequence[str]) -> None:
     keys = {field.name for field in dataclasses.fields(Options)}
     options = cli.parse(Options, [word for word in arguments if word.partition("=")[0] in keys])
     more = [word for word in arguments if word.partition("=")[0] not in keys]
+    runs = []  # all composed before the first is measured: a mistake in the last one would lose the others
+    for name in options.experiments.split(","):
+        groups = [f"experiment={name}", f"network={options.torso}", f"learner={options.learner}"]
+        words = [*groups, f"env.num_envs={options.num_envs}", *more]
+        runs.append((words, compose(words)))
     device = {
         "device": jax.devices()[0].device_kind,
         "processor": platform.processor() or platform.machine(),
@@ -193,10 +198,7 @@ def main(arguments: Sequence[str]) -> None:
     }
     print("  ".join(f"{key} {value}" for key, value in device.items()), flush=True)
     records = []
-    for name in options.experiments.split(","):
-        groups = [f"experiment={name}", f"network={options.torso}", f"learner={options.learner}"]
-        words = [*groups, f"env.num_envs={options.num_envs}", *more]
-        config = compose(words)
+    for words, config in runs:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             record = pool.apply(measure, (words, options))
         if options.startup:

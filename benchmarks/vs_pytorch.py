@@ -30,7 +30,7 @@ from foajax import cli
 from foajax.agent import Agent
 from foajax.allocator import keep_memory
 from foajax.compose import compose
-from foajax.config import ConfigError
+from foajax.config import Config, ConfigError, NetworkConfig
 from foajax.foveation import image_shapes
 from foajax.optimizer import make_optimizer
 from foajax.types import CoreState, NetworkOutput
@@ -56,7 +56,7 @@ class Options:
         cli.check_file("out", self.out)
 
 
-def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
+def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]:
     """The network of `foajax.networks` in PyTorch's own operations, and its parameters as leaves."""
     import torch
     import torch.nn.functional as F
@@ -78,6 +78,9 @@ def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
         def nature(x: Any) -> Any:
             strides = (layers[0][0].shape[-1] // 2, 2, 1)
             for (weight, bias), stride in zip(layers, strides, strict=False):
+                if network.padding == "cover":
+                    bottom, right = (-(size - weight.shape[-1]) % stride for size in x.shape[2:])
+                    x = F.pad(x, (0, right, 0, bottom))
                 x = F.relu(F.conv2d(x, weight, bias, stride=stride))
             return x
 
@@ -87,7 +90,7 @@ def torch_network(params: dict, torso: str) -> tuple[Callable, list]:
                 x = F.relu(F.max_pool2d(x, 2) if min(x.shape[2:]) > 4 else x)
             return x
 
-        run = nature if torso == "nature" else a3c
+        run = nature if network.torso == "nature" else a3c
         return lambda x: run(x).permute(0, 2, 3, 1).flatten(1)  # features in the order of foajax's
 
     torsos = {int(name[6:]): convolutions(own) for name, own in params.items() if name.startswith("torso_")}
@@ -132,11 +135,10 @@ def flat_loss(outputs: Sequence[Any], log_softmax: Callable, actions: Callable) 
     return total
 
 
-def measure(name: str, options: Options) -> dict[str, Any]:
+def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
     """One experiment on both sides."""
     import torch
 
-    config = compose([f"experiment={name}", f"network={options.torso}", "learner=a2c"])
     agent = Agent(config, ACTIONS, None)
     params = agent.initial_params(jax.random.key(0))
     random = np.random.default_rng(0)
@@ -170,7 +172,7 @@ def measure(name: str, options: Options) -> dict[str, Any]:
         training[:] = update(*training)
         jax.block_until_ready(training)
 
-    forward, leaves = torch_network(params["params"], options.torso)
+    forward, leaves = torch_network(params["params"], config.network)
     images = [torch.tensor(x.reshape(-1, *x.shape[2:]).transpose(0, 3, 1, 2)).contiguous() for x in roi]
     point = torch.tensor(unit.reshape(-1, 2)) if agent.network.sees_focal_point else None
     keep = torch.tensor(1.0 - is_first[..., None].astype(np.float32))
@@ -232,6 +234,10 @@ def _medians(calls: Sequence[Callable], repeats: int) -> list[float]:
 def main(arguments: Sequence[str]) -> None:
     """Measures every experiment, prints a line each, writes JSON."""
     options = cli.parse(Options, arguments)
+    configs = {
+        name: compose([f"experiment={name}", f"network={options.torso}", "learner=a2c"])
+        for name in options.experiments.split(",")
+    }
     try:
         import torch
     except ImportError:
@@ -248,8 +254,8 @@ def main(arguments: Sequence[str]) -> None:
     }
     print("  ".join(f"{key} {value}" for key, value in device.items()))
     records = []
-    for name in options.experiments.split(","):
-        record = measure(name, options)
+    for name, config in configs.items():
+        record = measure(name, config, options)
         records.append(record | device)
         for part in ("forward", "forward_backward", "update"):
             speeds = record[part]

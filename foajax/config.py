@@ -267,8 +267,8 @@ class DistributedConfig:
             "a value for all three or for none",
         )
         if self.coordinator is not None and self.processes is not None and self.process is not None:
-            port = self.coordinator.rpartition(":")[2]
-            _check(port.isdecimal(), "distributed.coordinator", self.coordinator, "host:port of process 0")
+            host, _, port = self.coordinator.rpartition(":")
+            _check(host != "" and port.isdecimal(), "distributed.coordinator", self.coordinator, "host:port of process 0")
             _check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
             accepted = f"an integer from 0 to {self.processes - 1}"
             _check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)

@@ -2,7 +2,8 @@
 
 A row for each focal point: the frame with the focal areas drawn on it, what the sensor gives put back in
 its place, and for a packed layout the images themselves, which is all that the network is given. With
-`sensor=all`, every sensor of the paper and the log-polar one on one sheet.
+`sensor=all`, every sensor of the paper and the log-polar one on one sheet. Keys of the sensor change it or
+make one's own: `sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`.
 
 Frames are as the emulator draws them, not normalised, so that black is both black and hidden. The
 brightest pixel of the frame is drawn white.
@@ -49,7 +50,7 @@ Panel = tuple[str, Image.Image]  # caption and picture
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What the command takes."""
+    """What the command takes besides keys of the sensor."""
 
     sensor: str = "constant70"  # one of the group sensor/, or all
     game: str = "breakout"
@@ -204,9 +205,12 @@ def play(config: Config, steps: int) -> np.ndarray:
 
 def show(arguments: Sequence[str]) -> None:
     """The command; prints the path of what it wrote."""
-    options = cli.parse(Options, arguments)
+    own = [word for word in arguments if word.startswith("sensor.")]
+    options = cli.parse(Options, [word for word in arguments if word not in own])
     sheet = options.all or options.sensor == "all"
-    words = [f"game={options.game}", f"seed={options.seed}", "gaze=none"]
+    if sheet and own:
+        raise ConfigError(f"{own[0]}: accepted is a key of one sensor, without sensor=all")
+    words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
     configs = {name: compose([f"sensor={name}", *words]) for name in (_ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape

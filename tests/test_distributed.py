@@ -205,6 +205,15 @@ def test_a_process_whose_environment_fails_says_so_and_the_others_save(tmp_path,
     assert "; the first process saves what it can; details in " in errors[1]
 
 
+@pytest.mark.parametrize("address", ["", "localhost", "localhost:", ":1234", "1234", "localhost:ssh"])
+def test_an_address_without_a_port_is_refused(monkeypatch, address):
+    monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", address)
+    monkeypatch.setenv("JAX_NUM_PROCESSES", "2")
+    monkeypatch.setenv("JAX_PROCESS_ID", "0")
+    with pytest.raises(ConfigError, match=f"^JAX_COORDINATOR_ADDRESS={address}: accepted is host:port of process 0$"):
+        distributed.where(compose([]))
+
+
 def test_a_port_that_stays_taken_is_named(monkeypatch):
     monkeypatch.setattr(coordinator, "_LINGER", -5.0)
     with socket.create_server(("", 0)) as server:

@@ -97,6 +97,16 @@ def test_the_command(still, tmp_path, capsys):
     assert out.stat().st_size < 60_000  # of noise, which does not compress
 
 
+def test_a_sensor_of_ones_own(still, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        show, "draw", lambda frame, sensor, points, name: drawn.append(sensor) or Image.new("RGB", (9, 9))
+    )
+    for words in (["sensor=rings", "sensor.rings=[[40,40,1]]"], ["sensor=constant70", "sensor.pooling=stride"]):
+        assert cli.run(show.show, [*words, f"out={tmp_path / 'own.png'}"]) == 0
+    assert drawn == [RingSensor(rings=((40, 40, 1),)), RingSensor(rings=((70, 70, 2),), pooling="stride")]
+
+
 @pytest.mark.parametrize("word", ["all=true", "sensor=all"])
 def test_a_sheet_of_all_sensors(still, tmp_path, capsys, monkeypatch, word):
     names = []
@@ -130,6 +140,9 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
     "word, message",
     [
         ("sensor=constant71", "sensor=constant71: accepted is one of"),
+        ("sensor=rings", "sensor.rings: missing; accepted is sensor.rings=value"),
+        ("sensor.ring=3", "sensor.ring=3: unknown key; accepted are rings, kind, peripheral, layout, pooling"),
+        ("sensor=all sensor.layout=packed", "sensor.layout=packed: accepted is a key of one sensor, without sensor=a"),
         ("points=[[40,80]]", "points=[40, 80]: accepted is [y, x] inside the frame, 80x80"),
         ("points=40", "points=40: accepted is a list of [an integer, an integer]"),
         ("steps=-1", "steps=-1: accepted is an integer >= 0"),
@@ -138,7 +151,7 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
     ],
 )
 def test_a_mistake_is_one_line(still, word, message, capsys):
-    assert cli.run(show.show, [word]) == 2
+    assert cli.run(show.show, word.split()) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"foajax: error: {message}")
     assert error.count("\n") == 1

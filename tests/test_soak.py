@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from foajax.config import ConfigError
+
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "soak.py"
 spec = importlib.util.spec_from_file_location("soak", SCRIPT)
 soak = importlib.util.module_from_spec(spec)
@@ -51,6 +53,25 @@ def test_a_look_sees_this_process(tmp_path):
         after = soak.sample(os.getpid(), 0.0)
     assert after.files == before.files + 2 and after.memory - before.memory > 0.8 * len(ballast)
     assert after.threads >= 1
+
+
+@pytest.mark.parametrize("times", [[], [300.0], [0.0, 10.0, 1790.0, 1800.0], [0.0, 300.0, 310.0, 1200.0]])
+def test_too_few_rows_for_a_speed_are_named(times):
+    samples = [soak.Sample(float(second), 10**9, 20, 30) for second in range(1800)]
+    with pytest.raises(ConfigError, match=rf"^minutes=30: accepted is .*in all there are {len(times)}\)$"):
+        soak.verdict(samples, [{"time": time, "env_steps": int(1000 * time)} for time in times], 1800.0)
+
+
+@pytest.mark.parametrize("run", ["soak", "nowhere/soak"])
+def test_a_training_that_fails_is_shown_and_no_file_of_others_is_touched(tmp_path, monkeypatch, capsys, run):
+    (tmp_path / "python").write_text("#!/bin/sh\necho why\nexit 3\n")
+    (tmp_path / "python").chmod(0o755)
+    (tmp_path / "log").write_text("the user's")
+    monkeypatch.setattr(soak.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(soak, "_EVERY", 0.1)
+    monkeypatch.setattr(soak, "sample", lambda process, begin: soak.Sample(0.0, 1, 1, 1))
+    assert soak.main([f"run={tmp_path / run}"]) == 3
+    assert capsys.readouterr().err == "why\n" and (tmp_path / "log").read_text() == "the user's"
 
 
 @pytest.mark.slow

@@ -90,6 +90,8 @@ def test_runs_beside_one_another_share_the_cores(make):
         assert first | second == mine == os.sched_getaffinity(0)
         if len(mine) > 1:
             assert (first & second == set()) == (jobs == 2)
+    assert sweep.run_all([*runs, last := make("last", "finish")], jobs=4, command=COMMAND) == 0
+    assert cores_of(last) == mine  # nothing else is left to run beside it
 
 
 def test_more_runs_than_cores_share_them_too():
