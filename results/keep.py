@@ -19,10 +19,12 @@ import numpy as np
 import yaml
 
 from foajax import cli
+from foajax.compose import compose
 from foajax.config import ConfigError, to_mapping
 from foajax.curves import RunData, colours_of, draw_curves, read_run
 from foajax.foveation import pixel_count
 from foajax.report import games_of
+from foajax.rundir import FREE, flatten, load_config
 
 KEPT = Path(__file__).parent / "runs"
 _ROWS = 500
@@ -96,21 +98,33 @@ def row(run: RunData) -> list[str]:
     ]
 
 
+def command_today(path: Path) -> str:
+    """The words that a kept run was made by, and the keys whose defaults have changed since."""
+    given = shlex.split(json.loads((path / "run.json").read_text())["command"].partition("foajax.train ")[2])
+    made, today = (dict(flatten(to_mapping(config))) for config in (load_config(path), compose(given)))
+    changed = {key: value for key, value in made.items() if key not in FREE and today.get(key) != value}
+    more = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in changed.items()]
+    return f"python -m foajax.train {shlex.join(given + more)}"
+
+
 def main(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
     if options.run is not None:
         print(keep(Path(options.run), options.name))
-    runs = [_named(read_run(path)) for path in sorted(KEPT.iterdir()) if path.is_dir()]
+    paths = [path for path in sorted(KEPT.iterdir()) if path.is_dir()]
+    runs = [_named(read_run(path)) for path in paths]
     head = ["game", "experiment", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     lines = [head, ["---"] * len(head), *map(row, runs)]
     intro = (
         "Score: mean and standard error over 30 whole games, unclipped, sampled policy, of the last checkpoint. Some\n"
-        "were stopped before their `train.env_steps`. Each `run.json` has the command, with the commit whose defaults\n"
-        "it is meant for, and the machine. Made by `results/keep.py`."
+        "were stopped before their `train.env_steps`. Each `run.json` has the command, the commit and the machine. Made\n"
+        "by `results/keep.py`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    (KEPT / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n")
+    commands = "\n".join(map(command_today, paths))
+    repeat = f"The same, in the words of today's defaults:\n\n```sh\n{commands}\n```"
+    (KEPT / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n\n{repeat}\n")
     for game, groups in games_of(runs, None).items():
         draw_curves(groups, game, colours_of(groups)).savefig(KEPT / f"{game}.png", dpi=110)
 
