@@ -118,8 +118,8 @@ def main(arguments: Sequence[str]) -> None:
     lines = [head, ["---"] * len(head), *map(row, runs)]
     intro = (
         "Score: mean and standard error over 30 whole games, unclipped, sampled policy, of the last checkpoint. Some\n"
-        "were stopped before their `train.env_steps`. Each `run.json` has the command, the commit and the machine. Made\n"
-        "by `results/keep.py`."
+        "were stopped before their `train.env_steps`. Each `run.json` has the command, the commit and the machine.\n"
+        "Made by `results/keep.py`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     commands = "\n".join(map(command_today, paths))
