@@ -157,7 +157,7 @@ class NetworkConfig:
     torso: Literal["nature", "a3c"] = "nature"
     dense: int = 256  # units between torso and LSTM; 0 for none
     lstm: int = 256
-    padding: Literal["cover", "valid"] = "cover"  # of the nature torso; valid: strides leave out last rows and columns
+    padding: Literal["cover", "valid"] = "cover"  # valid: the nature torso leaves out what its strides do not fit
     focal_point: Literal["always", "packed"] = "always"  # which gaze tells the LSTM where it is; packed: no canvas's
     lstm_norm: bool = True  # layer norm of the input's part of the LSTM's gates
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
@@ -268,7 +268,9 @@ class DistributedConfig:
         )
         if self.coordinator is not None and self.processes is not None and self.process is not None:
             host, _, port = self.coordinator.rpartition(":")
-            _check(host != "" and port.isdecimal(), "distributed.coordinator", self.coordinator, "host:port of process 0")
+            _check(
+                host != "" and port.isdecimal(), "distributed.coordinator", self.coordinator, "host:port of process 0"
+            )
             _check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
             accepted = f"an integer from 0 to {self.processes - 1}"
             _check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)

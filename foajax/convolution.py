@@ -41,9 +41,11 @@ def convolve_plain(x: Array, kernel: Array, stride: int) -> Array:
 
 
 def _convolve_cpu(x: Array, kernel: Array, stride: int) -> Array:
-    height, width = kernel.shape[:2]
-    if stride > 1 and height % stride == 0 and width % stride == 0:
-        # Kernel and stride of a block are 1: fewer and longer slices to copy.
+    if stride > 1:
+        # Kernel and stride of a block are 1: fewer and longer slices to copy. Zeros complete a kernel's last blocks.
+        rows, columns = ((0, -size % stride) for size in kernel.shape[:2])
+        x, kernel = jnp.pad(x, ((0, 0), rows, columns, (0, 0))), jnp.pad(kernel, (rows, columns, (0, 0), (0, 0)))
+        height, width = kernel.shape[:2]
         x, kernel, stride = _fold_image(x, height, width, stride), _fold_kernel(kernel, stride), 1
     return _patch_convolution(x, kernel, stride)
 

@@ -23,12 +23,12 @@ class Convolution(nn.Module):
     """One convolution with a bias; the form is chosen by the backend."""
 
     features: int
-    kernel: int
+    kernel: tuple[int, int]
     stride: int = 1
 
     @nn.compact
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N h w D"]:
-        shape = (self.kernel, self.kernel, x.shape[-1], self.features)
+        shape = (*self.kernel, x.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.orthogonal(_RELU_GAIN), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         return convolve(x, kernel, stride=self.stride) + bias.reshape(1, 1, 1, -1)
@@ -40,7 +40,8 @@ class NatureTorso(nn.Module):
     A packed image is already subsampled, so below 44 pixels the first layer halves its kernel and stride: a
     unit then sees about the same patch of the frame as on the canvas. Layers that no longer fit are left out.
     The strides fit the 84 pixels of that paper and leave out the last 4 rows and columns of 80, where Breakout has
-    its paddle: with `covers`, images and maps are padded with zeros until they fit.
+    its paddle. With `covers` nothing is left out: the first kernel grows by what its stride leaves, which costs little
+    there, and the maps of the others are padded with zeros.
     """
 
     covers: bool = True
@@ -48,17 +49,17 @@ class NatureTorso(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
         first = (8, 4) if min(x.shape[1:3]) >= 44 else (4, 2)
-        for features, (kernel, stride) in ((32, first), (64, (4, 2)), (64, (3, 1))):
-            if min(x.shape[1:3]) >= kernel:
-                x = _pad_to_fit(x, kernel, stride) if self.covers else x
-                x = nn.relu(Convolution(features, kernel, stride)(x))
+        for layer, (features, (kernel, stride)) in enumerate(((32, first), (64, (4, 2)), (64, (3, 1)))):
+            if min(x.shape[1:3]) < kernel:
+                continue
+            height = width = kernel
+            if self.covers and layer == 0:
+                height, width = (kernel + (size - kernel) % stride for size in x.shape[1:3])
+            elif self.covers:
+                bottom, right = (-(size - kernel) % stride for size in x.shape[1:3])
+                x = jnp.pad(x, ((0, 0), (0, bottom), (0, right), (0, 0)))
+            x = nn.relu(Convolution(features, (height, width), stride)(x))
         return x.reshape(x.shape[0], -1)
-
-
-def _pad_to_fit(x: Float[Array, "N H W C"], kernel: int, stride: int) -> Float[Array, "N h w C"]:
-    """Zeros at the bottom and at the right, so that a convolution leaves nothing out."""
-    bottom, right = (-(size - kernel) % stride for size in x.shape[1:3])
-    return jnp.pad(x, ((0, 0), (0, bottom), (0, right), (0, 0)))
 
 
 class A3CTorso(nn.Module):
@@ -71,7 +72,7 @@ class A3CTorso(nn.Module):
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
         for features, kernel, border in ((32, 5, 2), (32, 5, 1), (64, 4, 1), (64, 3, 1)):
             x = jnp.pad(x, ((0, 0), (border, border), (border, border), (0, 0)))
-            x = Convolution(features, kernel)(x)
+            x = Convolution(features, (kernel, kernel))(x)
             x = nn.relu(max_pool(x) if min(x.shape[1:3]) > 4 else x)
         return x.reshape(x.shape[0], -1)
 
