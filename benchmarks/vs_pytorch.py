@@ -76,10 +76,12 @@ def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]
         layers = [(leaf(c["kernel"], 3, 2, 0, 1), leaf(c["bias"])) for _, c in sorted(own.items())]
 
         def nature(x: Any) -> Any:
-            strides = (layers[0][0].shape[-1] // 2, 2, 1)
+            strides = (4 if layers[0][0].shape[-1] >= 8 else 2, 2, 1)
             for (weight, bias), stride in zip(layers, strides, strict=False):
                 if network.padding == "cover":
-                    bottom, right = (-(size - weight.shape[-1]) % stride for size in x.shape[2:])
+                    bottom, right = (
+                        -(size - k) % stride for size, k in zip(x.shape[2:], weight.shape[2:], strict=True)
+                    )
                     x = F.pad(x, (0, right, 0, bottom))
                 x = F.relu(F.conv2d(x, weight, bias, stride=stride))
             return x

@@ -181,7 +181,9 @@ def _trim(path: Path, start_env_steps: int) -> float:
             kept.append(line)
             seconds = float(row["time"])
     if content and not kept:
-        path.replace(path.with_name("metrics.old.jsonl"))
+        old = path.with_name("metrics.old.jsonl")
+        durable.replace(old, (old.read_bytes() if old.exists() else b"") + content)
+        path.unlink()
     elif b"".join(kept) != content:
         durable.replace(path, b"".join(kept))
     return seconds

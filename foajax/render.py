@@ -1,7 +1,8 @@
 """`python -m foajax.render run=<dir> episodes=1`: whole games as videos, and where the agent looked.
 
-Writes `episode-<seed>.mp4` (a GIF where the extra `video` is not installed), `heatmap.png` and `heatmap.json`, at the
-speed at which the game is played: 15 decisions a second on Atari with its 60 frames and a frame skip of 4.
+Writes `episode-<seed>.mp4` (a GIF of the first 1,000 steps where the extra `video` is not installed), `heatmap.png` and
+`heatmap.json`, at the speed at which the game is played: 15 decisions a second on Atari with its 60 frames and a frame
+skip of 4.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def write_video(recording: Recording, file: Path, bar: Progress) -> None:
         write = _write_gif
         if steps > _GIF_STEPS:
             remedy = "whole games are for format=mp4 (pip install -e '.[video]')"
-            bar.console.print(f"{file}: the first {_GIF_STEPS:,} of {steps:,} steps; {remedy}")
+            bar.console.print(f"{file}: the first {_GIF_STEPS:,} of {steps:,} steps; {remedy}", markup=False)
         steps = min(steps, _GIF_STEPS)
     task = bar.add_task(file.name, total=steps, note="")
     frames = (scene.draw(i) for i in range(steps))

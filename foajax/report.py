@@ -325,7 +325,9 @@ def _make_map(run: RunData, episodes: int) -> HeatMap | None:
     with progress_bar() as bar:
         games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
         heat = heatmap.heat_map([game._replace(images=()) for game in games])
-    heatmap.save(heat, directory, f"{run.config.name} on {run.config.game}")
+    there = heatmap.read(file) if (file := directory / heatmap.FILE).exists() else None
+    if there is None or (there.policy != "greedy" and there.whole_games is not False):  # others were made on purpose
+        heatmap.save(heat, directory, f"{run.config.name} on {run.config.game}")
     return heat
 
 

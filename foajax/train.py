@@ -390,8 +390,8 @@ def train(config: Config) -> int:
 def _train(config: Config) -> None:
     window, frame = config.sensor.window, config.env.frame_shape
     if config.gaze.mode == "none" and window != frame:
-        area = f"of {window[0]}x{window[1]} in a frame of {frame[0]}x{frame[1]}"
-        raise ConfigError(f"gaze.mode=none: accepted is learned, frozen, random or scripted for a focal area {area}")
+        sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
+        raise ConfigError(f"gaze.mode=none: accepted is a focal area {sizes}; or learned, frozen, random, scripted")
     with contextlib.ExitStack() as resources:
         if config.profile:
             if config.train.devices > 1 or distributed.where(config):

@@ -104,7 +104,7 @@ def command_today(path: Path) -> str:
     made, today = (dict(flatten(to_mapping(config))) for config in (load_config(path), compose(given)))
     changed = {key: value for key, value in made.items() if key not in FREE and today.get(key) != value}
     more = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in changed.items()]
-    return f"python -m foajax.train {shlex.join(given + more)}"
+    return f"python -m foajax.train {shlex.join(given + more)} run=runs/{path.name}"
 
 
 def main(arguments: Sequence[str]) -> None:

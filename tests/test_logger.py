@@ -135,6 +135,9 @@ def test_a_start_without_checkpoints_keeps_the_rows_of_the_last_one(tmp_path):
         log.write({"env_steps": 50})
     assert [row["env_steps"] for row in rows(tmp_path)] == [50]
     assert (tmp_path / "metrics.old.jsonl").read_text() == "".join(WHOLE)
+    fresh = (tmp_path / "metrics.jsonl").read_text()
+    start(tmp_path, 0).close()
+    assert (tmp_path / "metrics.old.jsonl").read_text() == "".join(WHOLE) + fresh
 
 
 def test_a_file_that_cannot_be_opened_is_an_error_at_the_start(tmp_path):

@@ -64,7 +64,7 @@ def test_a_gaze_that_moves_tells_where_it_is_but_not_the_papers_canvas(words, se
     assert (np.abs(apply(focal_point) - apply(-focal_point)).max() > 1e-4) == sees
 
 
-@pytest.mark.parametrize("size", [80, 35, 30, 25, 18, 16])
+@pytest.mark.parametrize("size", [80, 50, 35, 30, 25, 18, 16])
 def test_the_nature_torso_leaves_out_no_pixel(size):
     image = jax.random.normal(jax.random.key(0), (4, size, size, 1))
     torso = make_torso(NetworkConfig())

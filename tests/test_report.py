@@ -210,6 +210,21 @@ def test_a_heat_map_of_something_else_is_made_again(tmp_path, monkeypatch, chang
     assert (run in report.find_maps(games, 0)) == kept
 
 
+@pytest.mark.parametrize(
+    "change, replaced",
+    [({"env_steps": 2000}, True), (UNKNOWN, True), ({"policy": "greedy"}, False), ({"whole_games": False}, False)],
+)
+def test_a_heat_map_that_was_made_on_purpose_is_not_overwritten(tmp_path, monkeypatch, change, replaced):
+    run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0, 3.0])
+    store_map(run, dataclasses.replace(CURRENT, **change))
+    monkeypatch.setattr(report, "load_agent", lambda path: None)
+    monkeypatch.setattr(report, "play", lambda *_, **__: iter(()))
+    monkeypatch.setattr(heatmap, "heat_map", lambda recordings: CURRENT)
+    before = heatmap.read(run / "render" / heatmap.FILE).to_json()
+    assert report.find_maps(report.games_of([curves.read_run(run)], None), 1)[run] is CURRENT
+    assert heatmap.read(run / "render" / heatmap.FILE).to_json() == (CURRENT.to_json() if replaced else before)
+
+
 def test_a_run_that_cannot_play_has_no_heat_map(tmp_path, capsys):
     run = make_run(tmp_path, "kept", words=["game=seek"], scores=[1.0])
     assert report.find_maps(report.games_of([curves.read_run(run)], None), 1) == {}

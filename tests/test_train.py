@@ -179,7 +179,7 @@ def test_two_processes_do_not_share_a_run(tmp_path):
         ("env.num_envs=many", "env.num_envs=many: accepted is an integer"),
         ("game=no_such_game", "game=no_such_game: accepted is"),
         ("experiment=constant71", "experiment=constant71: accepted is one of"),
-        ("gaze=none", "gaze.mode=none: accepted is learned, frozen, random or scripted for a focal area of 16x16"),
+        ("gaze=none", "gaze.mode=none: accepted is a focal area as large as the frame, 80x80, not 16x16; or"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, word, said):
