@@ -472,7 +472,7 @@ def test_gymnasium_renders(pixels):
 class Bare(Pixels):
     """Knows nothing of rendering."""
 
-    metadata: dict = {}
+    metadata = {"render_modes": []}
 
     def __init__(self, shape):
         super().__init__(shape)

@@ -166,8 +166,9 @@ def train(directory, *words):
 
 def test_two_experiments_and_two_seeds(tmp_path):
     (tmp_path / "sweep").mkdir()
-    words = ["experiment=nonfoa,constant50_sub2_packed", "seed=1,2", *TINY, "train.env_steps=2000"]
-    single = ["experiment=nonfoa", "seed=1", *TINY, "train.env_steps=1000"]
+    tiny = [*TINY, "gaze=learned"]
+    words = ["experiment=nonfoa,constant50_sub2_packed", "seed=1,2", *tiny, "train.env_steps=2000"]
+    single = ["experiment=nonfoa", "seed=1", *tiny, "train.env_steps=1000"]
     assert train(tmp_path / "sweep", *single)[0] == 0
     code, _, err = train(tmp_path / "sweep", "--multirun", "--jobs=2", *words)
     assert code == 0, err
@@ -193,7 +194,7 @@ def test_submitit_starts_each_run_in_a_job_of_its_own(tmp_path):
     pytest.importorskip("submitit")
     (tmp_path / "sweep").mkdir()
     launcher = ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=5"]
-    words = ["experiment=nonfoa", "learner.learning_rate=1e-3,1e-4", *TINY, "train.env_steps=1000"]
+    words = ["experiment=nonfoa", "learner.learning_rate=1e-3,1e-4", *TINY, "gaze=learned", "train.env_steps=1000"]
     for _ in range(2):
         code, _, err = train(tmp_path / "sweep", "--multirun", *launcher, *words)
         assert code == 0, err
