@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import multiprocessing
 import os
 import platform
@@ -25,7 +24,6 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -207,7 +205,7 @@ def main(arguments: Sequence[str]) -> None:
         print(_line(record), flush=True)
     _print(records)
     if options.out:
-        Path(options.out).write_text(json.dumps(records, indent=1) + "\n")
+        cli.write_json("out", options.out, records)
 
 
 def _line(record: dict[str, Any]) -> str:

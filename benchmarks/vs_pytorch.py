@@ -11,7 +11,6 @@ medians, in steps/s. Needs PyTorch (`pip install torch`), which foajax itself do
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import platform
 import statistics
@@ -19,7 +18,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -267,7 +265,7 @@ def main(arguments: Sequence[str]) -> None:
                 flush=True,
             )
     if options.out:
-        Path(options.out).write_text(json.dumps(records, indent=1) + "\n")
+        cli.write_json("out", options.out, records)
 
 
 if __name__ == "__main__":

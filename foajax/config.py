@@ -267,10 +267,7 @@ class DistributedConfig:
             "a value for all three or for none",
         )
         if self.coordinator is not None and self.processes is not None and self.process is not None:
-            host, _, port = self.coordinator.rpartition(":")
-            _check(
-                host != "" and port.isdecimal(), "distributed.coordinator", self.coordinator, "host:port of process 0"
-            )
+            check_address("distributed.coordinator", self.coordinator)
             _check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
             accepted = f"an integer from 0 to {self.processes - 1}"
             _check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)
@@ -352,6 +349,12 @@ class Config:
         """Where the run's files are."""
         game = "".join(c if c.isalnum() or c in "_-." else "-" for c in self.game)
         return self.run or f"runs/{game}-{self.name}-s{self.seed}"
+
+
+def check_address(key: str, value: str) -> None:
+    """`ConfigError`, about `key`, unless `value` says where other processes find the first one."""
+    host, _, port = value.rpartition(":")
+    _check(host != "" and port.isdecimal(), key, value, "host:port of process 0")
 
 
 def check_shares(config: Config, shares: int, key: str, value: object) -> None:

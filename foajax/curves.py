@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +14,7 @@ from matplotlib.figure import Figure
 
 from foajax.config import Config, ConfigError
 from foajax.drawing import STYLE
-from foajax.rundir import load_config
+from foajax.rundir import load_config, parse_row
 from foajax.scores import CONFIDENCE, RESAMPLES, Interval
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
@@ -60,7 +58,7 @@ def read_run(path: str | Path) -> RunData:
     config = load_config(path)
     file = path / "metrics.jsonl"
     try:
-        rows = _rows(file.read_bytes())
+        rows = [row for line in file.read_bytes().splitlines() if (row := parse_row(line, "score"))]
         file = path / "score.json"
         evaluation = json.loads(file.read_text()) if file.exists() else None
         if evaluation is not None:
@@ -69,20 +67,8 @@ def read_run(path: str | Path) -> RunData:
         raise ConfigError(f"run={path}: its {file.name} is not readable") from None
     if not rows:
         raise ConfigError(f"run={path}: no game has ended in it yet; accepted is a run with scores")
-    env_steps, time, score = np.array(rows, float).T
+    env_steps, time, score = (np.array([row[key] for row in rows], float) for key in ("env_steps", "time", "score"))
     return RunData(path, config, env_steps, time, score, evaluation)
-
-
-def _rows(content: bytes) -> list[tuple[float, float, float]]:
-    """env_steps, time and score of all rows that have a score; what is torn or no row is left out, as by the logger."""
-    rows = []
-    for line in content.splitlines():
-        with contextlib.suppress(ValueError, RecursionError, LookupError, TypeError, OverflowError):
-            row = json.loads(line)
-            values = float(row["env_steps"]), float(row["time"]), float(row["score"])
-            if all(map(math.isfinite, values)):
-                rows.append(values)
-    return rows
 
 
 def band(runs: Sequence[RunData], axis: str) -> Band | None:

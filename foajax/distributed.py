@@ -31,7 +31,7 @@ from jax.experimental import multihost_utils
 from jaxlib import _jax
 
 from foajax import coordinator
-from foajax.config import Config, ConfigError, check_shares
+from foajax.config import Config, ConfigError, check_address, check_shares
 
 T = TypeVar("T")
 
@@ -165,10 +165,7 @@ def where(config: Config) -> dict[str, Any] | None:
         except (KeyError, ValueError):
             names = "JAX_NUM_PROCESSES and JAX_PROCESS_ID, integers, beside JAX_COORDINATOR_ADDRESS"
             raise ConfigError(f"distributed: accepted is {names}") from None
-        address = os.environ["JAX_COORDINATOR_ADDRESS"]
-        host, _, port = address.rpartition(":")
-        if not (host and port.isdecimal()):
-            raise ConfigError(f"JAX_COORDINATOR_ADDRESS={address}: accepted is host:port of process 0")
+        check_address("JAX_COORDINATOR_ADDRESS", os.environ["JAX_COORDINATOR_ADDRESS"])
         return {"num_processes": count, "process_id": index, "cluster_detection_method": "deactivate"}
     # A step of one task is a run of its own, whatever the job around it holds.
     if int(os.environ.get("SLURM_STEP_NUM_TASKS", "1")) > 1:

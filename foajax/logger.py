@@ -28,6 +28,7 @@ from jaxtyping import UInt8
 
 from foajax import durable
 from foajax.display import Display
+from foajax.rundir import parse_row
 from foajax.types import Outcome
 
 _WARN_EVERY = 60.0  # seconds between two warnings about the same output
@@ -176,7 +177,7 @@ def _trim(path: Path, start_env_steps: int) -> float:
     content = path.read_bytes() if path.exists() else b""
     kept, seconds = [], 0.0
     for line in content.splitlines(keepends=True):
-        row = _parse(line)
+        row = parse_row(line) if line.endswith(b"\n") else None
         if row is not None and row["env_steps"] <= start_env_steps:
             kept.append(line)
             seconds = float(row["time"])
@@ -187,15 +188,6 @@ def _trim(path: Path, start_env_steps: int) -> float:
     elif b"".join(kept) != content:
         durable.replace(path, b"".join(kept))
     return seconds
-
-
-def _parse(line: bytes) -> dict[str, Any] | None:
-    try:
-        row = json.loads(line)
-        numbers = math.isfinite(row["env_steps"]) and math.isfinite(row["time"])
-    except (ValueError, RecursionError, LookupError, TypeError, OverflowError):
-        return None
-    return row if numbers and line.endswith(b"\n") else None
 
 
 class _EventFile:

@@ -16,6 +16,7 @@ import datetime
 import fcntl
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import socket
@@ -263,6 +264,15 @@ def _has_begun(path: Path) -> bool:
     """Whether a row or a checkpoint is there."""
     rows, checkpoints = path / "metrics.jsonl", path / "checkpoints"
     return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
+
+
+def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
+    """A row of ``metrics.jsonl`` with finite ``env_steps``, ``time`` and `more`; None where it is torn or none."""
+    try:
+        row = json.loads(line)
+        return row if all(math.isfinite(row[key]) for key in ("env_steps", "time", *more)) else None
+    except (ValueError, RecursionError, LookupError, TypeError, OverflowError):
+        return None
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -16,12 +16,10 @@ import contextlib
 import dataclasses
 import datetime
 import functools
-import json
-import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -141,15 +139,7 @@ def _last_rows(path: Path) -> list[dict[str, Any]]:
             lines = file.read().splitlines()
     except OSError:
         return []
-    return list(_rows(lines))
-
-
-def _rows(lines: list[bytes]) -> Iterator[dict[str, Any]]:
-    for line in lines:
-        with contextlib.suppress(ValueError, RecursionError, LookupError, TypeError, OverflowError):
-            row = json.loads(line)
-            if math.isfinite(row["env_steps"]) and math.isfinite(row["time"]):
-                yield row
+    return [row for line in lines if (row := rundir.parse_row(line))]
 
 
 def _speed(rows: list[dict[str, Any]]) -> float | None:
