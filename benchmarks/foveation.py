@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import os
 import platform
 import statistics
@@ -24,19 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from foajax import cli, cost
+from foajax.compose import compose
 from foajax.config import LogPolarSensor, RingSensor, Sensor
 from foajax.foveation import sense
+from foajax.show import PAPER
 
-DECREASING = ((30, 30, 1), (50, 50, 2), (70, 70, 4))
-TABLE_II = {
-    "nonfoa": RingSensor(((80, 80, 1),)),
-    "constant50_sub1": RingSensor(((50, 50, 1),)),
-    "constant50_sub2": RingSensor(((50, 50, 2),)),
-    "constant70": RingSensor(((70, 70, 2),)),
-    "decreasing": RingSensor(DECREASING),
-    "constant70_p": RingSensor(((70, 70, 2),), peripheral=(5, 5)),
-    "decreasing_p": RingSensor(DECREASING, peripheral=(5, 5)),
-}
+TABLE_II = {name: compose([f"experiment={name}"]).sensor for name in PAPER}
 CONSTANT70_PACKED = RingSensor(((70, 70, 2),), layout="packed")
 
 
@@ -152,8 +144,7 @@ def main(arguments: Sequence[str]) -> None:
     print("256 frames, constant70 packed, against a loop of OpenCV crop and resize")
     results["opencv_us"] = against_opencv()
     if options.out:
-        with open(options.out, "w") as file:
-            json.dump(results, file, indent=2)
+        cli.write_json("out", options.out, results)
 
 
 if __name__ == "__main__":

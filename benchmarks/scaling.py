@@ -279,10 +279,9 @@ def main(arguments: Sequence[str]) -> None:
         result["microseconds by parameters"] = allreduce(cores)
     if options.part in ("all", "model"):
         result["model"] = model()
-    text = json.dumps(result, indent=1)
-    print(text)
+    print(json.dumps(result, indent=1))
     if options.out:
-        Path(options.out).write_text(text + "\n")
+        cli.write_json("out", options.out, result)
 
 
 if __name__ == "__main__":

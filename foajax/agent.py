@@ -15,6 +15,7 @@ from foajax.config import Config
 from foajax.foveation import sense
 from foajax.losses import log_prob
 from foajax.types import (
+    SCREEN_SHAPE,
     ActorOutput,
     ActorState,
     CoreState,
@@ -116,7 +117,11 @@ class Agent:
         return cast(tuple[NetworkOutput, CoreState], self.network.apply(params, *inputs))
 
     def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W"]:
-        """Screens as frames in [0, 1]."""
+        """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
+        shape = self.config.env.frame_shape if self.crop_top is None else SCREEN_SHAPE
+        if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
+            accepted = f"uint8 [B, {shape[0]}, {shape[1]}], gray"
+            raise ValueError(f"frame={screen.dtype} {list(screen.shape)}: accepted is {accepted}")
         return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
 
     def normalise(self, frame: Float[Array, "B H W"], statistics: FrameStatistics) -> Float[Array, "B H W"]:
@@ -155,7 +160,7 @@ class Agent:
         return jax.vmap(look)(frame, focal_point)
 
     def unit(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """Focal points in [-1, 1]."""
+        """Focal points in [-1, 1)."""
         return gaze.to_unit(focal_point, self.config.env.frame_shape)
 
     @property

@@ -62,7 +62,7 @@ def _to_stderr(text: str) -> None:
 class Checkpoints:
     """The checkpoints of one run. One process may write; any number may read meanwhile.
 
-    A writer is closed (or used in a `with`) before the process ends, or its last write may be lost.
+    A writer is used in a `with`, or waited for, before the process ends, or its last write may be lost.
 
     Args:
       directory: where they are; created by the first save.
@@ -133,15 +133,11 @@ class Checkpoints:
         if self._writer is not None:
             self._writer.join()
 
-    def close(self) -> None:
-        """Waits for the last write."""
-        self.wait()
-
     def __enter__(self) -> Checkpoints:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self.wait()
 
     def restore(self, template: Any) -> Restored | None:
         """The newest usable checkpoint, to go on from; None where there is none at all.

@@ -31,6 +31,14 @@ def _show(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
+def _check_types(config: Any, key: str) -> None:
+    """For what is also built in Python: the types that `build` checks of a mapping."""
+    hints = typing.get_type_hints(type(config))
+    for field in dataclasses.fields(config):
+        value = _convert(hints[field.name], getattr(config, field.name), f"{key}.{field.name}")
+        object.__setattr__(config, field.name, value)
+
+
 @dataclasses.dataclass(frozen=True)
 class RingSensor:
     """A focal area of nested rings; non-FoA, Constant, Decreasing and their (P) forms (Table II)."""
@@ -42,6 +50,7 @@ class RingSensor:
     pooling: Literal["mean", "stride"] = "mean"
 
     def __post_init__(self) -> None:
+        _check_types(self, "sensor")
         _check(len(self.rings) > 0, "sensor.rings", self.rings, "at least one [height, width, factor]")
         for ring in self.rings:
             height, width, factor = ring
@@ -75,6 +84,7 @@ class LogPolarSensor:
     sampling: Literal["area", "bilinear"] = "area"
 
     def __post_init__(self) -> None:
+        _check_types(self, "sensor")
         _check(2 <= self.rings <= 1000, "sensor.rings", self.rings, "an integer from 2 to 1000")
         _check(4 <= self.wedges <= 1000, "sensor.wedges", self.wedges, "an integer from 4 to 1000")
         _check(self.fovea > 0, "sensor.fovea", self.fovea, "a radius > 0")
@@ -103,6 +113,7 @@ class GazeConfig:
     path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn, moved within bounds
 
     def __post_init__(self) -> None:
+        _check_types(self, "gaze")
         _check(1 <= self.step <= 10_000, "gaze.step", self.step, "an integer from 1 to 10000")
         if self.mode == "scripted":
             _check(len(self.path) > 0, "gaze.path", self.path, "at least one [y, x] where gaze.mode=scripted")
@@ -284,7 +295,7 @@ class Config:
     seed: int = 0
     run: str | None = None  # run directory; null for runs/<game>-<name>-s<seed>
     profile: bool = False
-    gaze: GazeConfig = GazeConfig()
+    gaze: GazeConfig = dataclasses.field(default_factory=GazeConfig)
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()

@@ -8,8 +8,6 @@ images at a time. Both forms compute the same numbers; which one is used is sett
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -46,8 +44,8 @@ def _convolve_cpu(x: Array, kernel: Array, stride: int) -> Array:
         rows, columns = ((0, -size % stride) for size in kernel.shape[:2])
         x, kernel = jnp.pad(x, ((0, 0), rows, columns, (0, 0))), jnp.pad(kernel, (rows, columns, (0, 0), (0, 0)))
         height, width = kernel.shape[:2]
-        x, kernel, stride = _fold_image(x, height, width, stride), _fold_kernel(kernel, stride), 1
-    return _patch_convolution(x, kernel, stride)
+        x, kernel = _fold_image(x, height, width, stride), _fold_kernel(kernel, stride)
+    return _patch_convolution(x, kernel)
 
 
 def _fold_image(x: Array, height: int, width: int, stride: int) -> Array:
@@ -66,38 +64,34 @@ def _fold_kernel(kernel: Array, stride: int) -> Array:
     return kernel.reshape(height // stride, width // stride, stride * stride * channels, features)
 
 
-def _patches(x: Array, height: int, width: int, stride: int) -> Array:
-    """All patches as rows: [N*h*w, height*width*C]. Stacking is many times faster than concatenating."""
+def _patches(x: Array, height: int, width: int) -> Array:
+    """All patches, one a pixel, as rows: [N*h*w, height*width*C]. Stacking is many times faster than concatenating."""
     n, rows, columns, channels = x.shape
-    h, w = (rows - height) // stride + 1, (columns - width) // stride + 1
-    slices = [
-        x[:, i : i + stride * (h - 1) + 1 : stride, j : j + stride * (w - 1) + 1 : stride]
-        for i in range(height)
-        for j in range(width)
-    ]
+    h, w = rows - height + 1, columns - width + 1
+    slices = [x[:, i : i + h, j : j + w] for i in range(height) for j in range(width)]
     return jnp.stack(slices, axis=3).reshape(n * h * w, height * width * channels)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _patch_convolution(x: Array, kernel: Array, stride: int) -> Array:
-    return _patch_forward(x, kernel, stride)[0]
+@jax.custom_vjp
+def _patch_convolution(x: Array, kernel: Array) -> Array:
+    return _patch_forward(x, kernel)[0]
 
 
-def _patch_forward(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array, Array | None]]:
+def _patch_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array, Array | None]]:
     height, width, _, features = kernel.shape
-    h, w = (x.shape[1] - height) // stride + 1, (x.shape[2] - width) // stride + 1
+    h, w = x.shape[1] - height + 1, x.shape[2] - width + 1
     flat = kernel.reshape(-1, features)
     part = _images_at_once(x, h * w * flat.shape[0])
     patches = None
     if part == x.shape[0]:
-        patches = _patches(x, height, width, stride)
+        patches = _patches(x, height, width)
         y = patches @ flat
     else:
-        y = jax.lax.map(lambda images: _patches(images, height, width, stride) @ flat, _split(x, part))
+        y = jax.lax.map(lambda images: _patches(images, height, width) @ flat, _split(x, part))
     return y.reshape(x.shape[0], h, w, features), (x, kernel, patches)
 
 
-def _patch_backward(stride: int, residuals: tuple[Array, Array, Array | None], dy: Array) -> tuple[Array, Array]:
+def _patch_backward(residuals: tuple[Array, Array, Array | None], dy: Array) -> tuple[Array, Array]:
     x, kernel, patches = residuals
     height, width, channels, features = kernel.shape
     flat = kernel.reshape(-1, features)
@@ -106,7 +100,7 @@ def _patch_backward(stride: int, residuals: tuple[Array, Array, Array | None], d
         dy = dy.reshape(-1, features)
         # The transposed product is the faster one of the two: the long axis is contracted with the few features first.
         dkernel = dy.T @ patches
-        (dx,) = jax.linear_transpose(lambda x: _patches(x, height, width, stride), images)(dy @ flat.T)
+        (dx,) = jax.linear_transpose(lambda x: _patches(x, height, width), images)(dy @ flat.T)
         return dkernel, dx
 
     if patches is not None:
@@ -116,7 +110,7 @@ def _patch_backward(stride: int, residuals: tuple[Array, Array, Array | None], d
     def add(total: Array, part: tuple[Array, Array]) -> tuple[Array, Array]:
         images, dy = part
         # Made again: that is faster than to fetch them from memory.
-        dkernel, dx = gradients(images, dy, _patches(images, height, width, stride))
+        dkernel, dx = gradients(images, dy, _patches(images, height, width))
         return total + dkernel, dx
 
     part = _images_at_once(x, dy.shape[1] * dy.shape[2] * flat.shape[0])

@@ -60,8 +60,6 @@ class Options:
 class Subject(NamedTuple):
     """An experiment to be measured."""
 
-    agent: Agent
-    params: Params
     exact: dict[str, Any]  # what is counted
     calls: dict[str, Callable[[], Any]]  # what is timed, by the name of the result
 
@@ -160,7 +158,7 @@ def _subject(config: Config) -> Subject:
     for batch in _BATCHES:
         for part, call in zip(_PARTS, _calls(agent, params, batch), strict=True):
             calls[f"{part}_us_batch{batch}"] = call
-    return Subject(agent=agent, params=params, exact=_count(agent, params), calls=calls)
+    return Subject(exact=_count(agent, params), calls=calls)
 
 
 def _count(agent: Agent, params: Params) -> dict[str, Any]:

@@ -26,9 +26,8 @@ from foajax import probes, seek
 from foajax.config import Config, ConfigError
 from foajax.gymnasium_env import GymnasiumEnvironment
 from foajax.jax_envs import JaxEnvironment, Task
-from foajax.types import Outcome, TimeStep
+from foajax.types import SCREEN_SHAPE, Outcome, TimeStep
 
-SCREEN_SHAPE = (210, 160)  # rows and columns of an Atari screen
 FRAME_SHAPE = (80, 80)  # of what `frames.crop_and_halve` makes of it
 
 OWN: dict[str, Callable[[tuple[int, int]], Task]] = {
@@ -46,7 +45,6 @@ class Environment(Protocol):
 
     num_envs: int  # B
     num_actions: int
-    screen_shape: tuple[int, ...]  # of `TimeStep.frame` without the batch
     crop_top: int | None  # first of the 160 screen rows kept; None where the screen is the frame
 
     @property
@@ -93,7 +91,6 @@ class EnvPoolEnvironment:
     """An Atari game of EnvPool, which steps in its own threads. `recv` hands out EnvPool's arrays, not copies."""
 
     crop_top: int | None
-    screen_shape: tuple[int, ...] = SCREEN_SHAPE
     lives: np.ndarray
     _ended: np.ndarray  # whether the last step ended an episode
     _over: np.ndarray  # whether it ended a game
@@ -173,7 +170,6 @@ class AleEnvironment:
     """An Atari game of ale-py's own vector environment, which steps in its own threads."""
 
     crop_top: int | None
-    screen_shape: tuple[int, ...] = SCREEN_SHAPE
     lives: np.ndarray
     _ended: np.ndarray  # whether the last step ended an episode
     _over: np.ndarray  # whether it ended a game

@@ -14,11 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from foajax import cli
-from foajax.agent import Agent
-from foajax.config import Config, ConfigError
-from foajax.envs import make
-from foajax.store import load_agent
-from foajax.types import FrameStatistics, Params
+from foajax.config import ConfigError
+from foajax.envs import Environment, make
+from foajax.store import Stored, load_agent
 
 _FIRST_SEED = 1_000_003  # apart from the seeds of training
 _SEEDS = 2**31 - 2_000_000  # the engines take 32 bits, and add an environment's number
@@ -50,42 +48,41 @@ class Games(NamedTuple):
     lengths: np.ndarray  # [episodes] agent steps
 
 
-def environment_seed(seed: int) -> int:
-    """Of the environments that an agent is watched in with `seed`; raises `ConfigError`."""
+def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = False) -> Environment:
+    """What an agent is watched in: the game that it was trained in, with seeds apart from those of training.
+
+    Raises:
+      ConfigError: a seed out of range; no such game, or one whose actions are no longer those of the training.
+    """
     if not 0 <= seed < _SEEDS:
         raise ConfigError(f"seed={seed}: accepted is an integer from 0 to {_SEEDS - 1}")
-    return _FIRST_SEED + seed
+    config, actions = stored.agent.config, stored.agent.num_actions
+    made = make(config, num_envs=num_envs, seed=_FIRST_SEED + seed, render=render)
+    if made.num_actions != actions:
+        made.close()
+        raise ConfigError(f"game={config.game}: has {made.num_actions} actions; accepted are {actions}, as in training")
+    return made
 
 
-def play(
-    config: Config,
-    params: Params,
-    statistics: FrameStatistics,
-    *,
-    episodes: int,
-    num_envs: int,
-    seed: int,
-    greedy: bool,
-) -> Games:
-    """Plays `episodes` games with fixed parameters, in the environment that the agent was trained in.
+def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: bool) -> Games:
+    """Plays `episodes` games with fixed parameters.
 
     Every environment plays the same number of games, so that short games are not over-represented.
     """
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
-    environment = make(config, num_envs=num_envs, seed=environment_seed(seed))
-    agent = Agent(config, environment.num_actions, environment.crop_top)
-    act = jax.jit(functools.partial(agent.act, greedy=greedy))
-    state = agent.initial_state(num_envs)
+    watched = environment(stored, num_envs=num_envs, seed=seed)
+    act = jax.jit(functools.partial(stored.agent.act, greedy=greedy))
+    state = stored.agent.initial_state(num_envs)
     key = jax.random.key(seed)
     returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
     finished: list[tuple[float, int]] = []
-    timestep, _ = environment.reset()
+    timestep, _ = watched.reset()
     step = 0
     while len(finished) < episodes:
-        output, _, state = act(params, statistics, state, timestep, jax.random.fold_in(key, step))
-        environment.send(np.asarray(output.natural_action))
-        timestep, outcome = environment.recv()
+        output, _, state = act(stored.params, stored.statistics, state, timestep, jax.random.fold_in(key, step))
+        watched.send(np.asarray(output.natural_action))
+        timestep, outcome = watched.recv()
         returns += outcome.score
         lengths += 1 - timestep.is_first
         for i in np.flatnonzero(outcome.is_over):
@@ -94,7 +91,7 @@ def play(
             games[i] += 1
             returns[i], lengths[i] = 0, 0
         step += 1
-    environment.close()
+    watched.close()
     return Games(returns=np.array([r for r, _ in finished]), lengths=np.array([n for _, n in finished]))
 
 
@@ -104,9 +101,7 @@ def evaluate(arguments: Sequence[str]) -> None:
     stored = load_agent(options.run, best=options.checkpoint == "best")
     config = stored.agent.config
     games = play(
-        config,
-        stored.params,
-        stored.statistics,
+        stored,
         episodes=options.episodes,
         num_envs=options.num_envs,
         seed=options.seed,

@@ -68,11 +68,14 @@ def sense(
         inside where it would, and then sensing takes about two thirds of the time.
 
     Raises:
-      ConfigError: a peripheral grid finer than the frame; other bounds, or 'window' and an area larger than the frame.
+      ConfigError: a focal point of fractions; a peripheral grid finer than the frame; other bounds, or 'window' and
+        an area larger than the frame.
     """
     if bounds not in ("window", "point"):
         raise ConfigError(f"bounds={bounds}: accepted is 'window' or 'point'")
     frame, focal_point = jnp.asarray(frame), jnp.asarray(focal_point)
+    if not jnp.issubdtype(focal_point.dtype, jnp.integer):
+        raise ConfigError(f"focal_point={focal_point.dtype}: accepted is integers, which foajax.gaze.from_unit makes")
     corner = focal_point - np.array(sensor.window) // 2
     if bounds == "window":
         room = np.array(frame.shape[:2]) - sensor.window

@@ -1,7 +1,7 @@
 """From a screen to a normalised frame: crop, 2x2 mean, running statistics.
 
 Pure functions on one frame; the caller vmaps. A frame is float32 [H, W] in [0, 1]: a screen's
-0..255 divided by 255. Where the crop and the statistics come from: paper-notes, "Preprocessing".
+0..255 divided by 255.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ actions are an emulator's. An id may name the module that registers it, e.g. `gy
 
 from __future__ import annotations
 
+import contextlib
 import functools
 
 import gymnasium
@@ -31,25 +32,26 @@ class GymnasiumEnvironment:
 
         def make_one() -> gymnasium.Env:
             env = gymnasium.make(name, disable_env_checker=True)
-            if render and "rgb_array" in env.metadata.get("render_modes", ()):
-                env.close()
-                env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)
+            if render and "rgb_array" in (env.metadata.get("render_modes") or ()):
+                with contextlib.suppress(TypeError):  # it may not take the argument
+                    env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)
             return TimeLimit(env, config.env.max_episode_steps)  # beside a limit of its own
 
         try:
             self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
-        except (gymnasium.error.Error, ImportError) as error:
+        except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
             reason = " ".join(str(error).split())
             raise ConfigError(f"game={config.game}: accepted is the id of an environment ({reason})") from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
         if not (is_pixels and isinstance(actions, spaces.Discrete)):
+            has = " and ".join(" ".join(str(space).split())[:80] for space in (observations, actions))
             raise ConfigError(
                 f"game={config.game}: accepted is an environment with discrete actions and uint8 images "
-                f"[h, w], [h, w, 1] or [h, w, 3], not {observations} and {actions}"
+                f"[h, w], [h, w, 1] or [h, w, 3], not {has}"
             )
         self.num_envs, self.num_actions = num_envs, int(actions.n)
-        self.screen_shape: tuple[int, ...] = config.env.frame_shape
+        self._shape = config.env.frame_shape
         self._first_action, self._seed, self._clip = int(actions.start), seed, config.env.clip_rewards
 
     def reset(self) -> tuple[TimeStep, Outcome]:
@@ -57,7 +59,7 @@ class GymnasiumEnvironment:
         self._image, _ = self._env.reset(seed=self._seed)
         zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
         self._ended = false
-        timestep = TimeStep(gray_frames(self._image, self.screen_shape), zeros, is_first=~false, is_terminal=false)
+        timestep = TimeStep(gray_frames(self._image, self._shape), zeros, is_first=~false, is_terminal=false)
         return timestep, Outcome(score=zeros, is_over=false)
 
     def send(self, action: np.ndarray) -> None:
@@ -69,7 +71,7 @@ class GymnasiumEnvironment:
         self._image, score, terminated, truncated, _ = self._env.step(self._action)
         score = score.astype(np.float32)
         timestep = TimeStep(
-            frame=gray_frames(self._image, self.screen_shape),
+            frame=gray_frames(self._image, self._shape),
             reward=np.sign(score) if self._clip else score,
             is_first=self._ended,
             is_terminal=terminated.copy(),
@@ -93,7 +95,11 @@ def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
     """Images, uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3] (RGB), as frames, uint8 [B, H, W] of `frame_shape`.
 
     Gray by ITU-R BT.601, resized by area means, each rounded half up: what agents of Gymnasium environments see.
+    `ValueError` for anything else.
     """
+    if images.dtype != np.uint8 or not (images.ndim == 3 or (images.ndim == 4 and images.shape[-1] in (1, 3))):
+        accepted = "uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3]"
+        raise ValueError(f"images={images.dtype} {list(images.shape)}: accepted is {accepted}")
     if images.ndim == 4:
         images = (images @ LUMA + 500) // 1000 if images.shape[-1] == 3 else images[..., 0]
     rows, columns = (area_weights(*sizes) for sizes in zip(images.shape[1:], frame_shape, strict=True))

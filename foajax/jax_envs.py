@@ -91,7 +91,6 @@ class JaxEnvironment:
     def __init__(self, task: Task, *, num_envs: int, seed: int) -> None:
         self.num_envs = num_envs
         self.num_actions = task.num_actions
-        self.screen_shape: tuple[int, ...] = task.frame_shape
         self._keys = jax.vmap(jax.random.key)(seed + np.arange(num_envs))
         self._reset = jax.jit(jax.vmap(partial(reset, task)))
         self._step = jax.jit(jax.vmap(partial(step, task)))

@@ -106,7 +106,7 @@ class Network(nn.Module):
         is_first: Bool[Array, "T B"],
         core_state: CoreState,
     ) -> tuple[NetworkOutput, CoreState]:
-        """`focal_point` in unit coordinates, [-1, 1]. Each output is [T, B, ...]."""
+        """`focal_point` in unit coordinates, [-1, 1). Each output is [T, B, ...]."""
         steps, batch = is_first.shape
         features = self.features([image.reshape(steps * batch, *image.shape[2:]) for image in roi])
         if self.sees_focal_point:

@@ -15,11 +15,11 @@ from rich.table import Table
 
 from foajax.agent import Agent
 from foajax.config import Config
-from foajax.envs import SCREEN_SHAPE, Environment
+from foajax.envs import Environment
 from foajax.learner import loss
 from foajax.programs import Programs, empty_rollout, make_programs, make_state
 from foajax.rollout import Collector, update_on
-from foajax.types import TimeStep
+from foajax.types import SCREEN_SHAPE, TimeStep
 
 _WARM_UP, _ROLLOUTS = 3, 5
 

@@ -39,7 +39,7 @@ def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
     if layout is None:
         update = functools.partial(learner.update, agent, optimizer, size)
         return Programs(act=jax.jit(act, donate_argnames="rollout"), update=jax.jit(update, donate_argnames="state"))
-    update = functools.partial(learner.update, agent, optimizer, size // layout.shards, axis=DATA)
+    update = functools.partial(learner.update, agent, optimizer, size // layout.job.size, axis=DATA)
     acting = (EVERYWHERE, BATCH, BATCH, ROLLOUT, EVERYWHERE, BATCH, EVERYWHERE)
     updating = (EVERYWHERE, ROLLOUT, EVERYWHERE, EVERYWHERE)
     return Programs(

@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
-from foajax import envs
+from foajax import envs, evaluate
 from foajax.agent import Agent
 from foajax.config import Config
-from foajax.evaluate import environment_seed
 from foajax.foveation import sense
 from foajax.painting import packed
 from foajax.store import Stored
@@ -48,7 +47,7 @@ class Screens(Sequence):
 class Recording(NamedTuple):
     """One game, from its first screen to its last: N of them, and N decisions.
 
-    Row t is what was seen at t and what was decided upon it. `reward` and `score` include what the action at t - 1
+    Row t is what was seen at t and what was decided upon it. `score` includes what the action at t - 1
     earned. The action decided at the last row of a life or of the game has no effect.
     """
 
@@ -123,7 +122,7 @@ def record(
     names = envs.action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
     decide = jax.jit(functools.partial(_decide, stored.agent, greedy))
     for game in range(seed, seed + episodes):
-        environment = envs.make(config, num_envs=1, seed=environment_seed(game), render=_in_colour(config))
+        environment = evaluate.environment(stored, num_envs=1, seed=game, render=_in_colour(config))
         try:
             played = _play(environment, stored, decide, jax.random.key(game), max_steps, progress)
         finally:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -24,11 +23,6 @@ _THINNEST = 9  # such a row
 _CHART = (960 - 2 * _MARGIN, 84)
 _PAPER, _PANEL, _INK, _FAINT = "#12161b", "#1b2128", "#e8edf2", "#8b98a5"
 _LOST, _REWARD = "#ff6b6b", "#ffd166"
-
-
-class _Place(NamedTuple):
-    left: int
-    top: int
 
 
 class Scene:

@@ -34,11 +34,6 @@ class Layout:
         self.job = Mesh(np.array(job), (DATA,))
         self.local = Mesh(np.array(local), (DATA,))
 
-    @property
-    def shards(self) -> int:
-        """How many devices share a minibatch."""
-        return self.job.size
-
     def replicate(self, tree: Any) -> Any:
         """Host arrays, the same in every process, on all devices."""
         place = NamedSharding(self.job, EVERYWHERE)

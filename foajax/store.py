@@ -139,7 +139,7 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
     names = named(wanted)
     if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
         raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
-    leaves = [arrays[name] for name in names]
+    leaves = [jnp.asarray(arrays[name]) for name in names]  # once: NumPy's would be handed over at each decision
     params, statistics = jax.tree.unflatten(jax.tree.structure(wanted), leaves)
     return Stored(agent, params, statistics, env_steps)
 

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+SCREEN_SHAPE = (210, 160)  # rows and columns of an Atari screen
+
 HostArray = Array | np.ndarray  # environments give NumPy arrays
 Params = Any  # the network's parameters, a pytree of float32 arrays
 

@@ -39,9 +39,8 @@ class EnvironmentFault(Exception):
 
 
 class Call(NamedTuple):
-    """What the main thread waits for."""
+    """What the main thread waits for; told from the same call later by its identity."""
 
-    number: int  # tells it from the same call later
     what: str
     timeout: float  # seconds
 
@@ -71,7 +70,6 @@ class Watchdog:
         self._timeout, self._abandon, self._is_saved, self._alone = timeout, abandon, is_saved, alone
         self._lock = threading.Lock()  # held for good by a watchdog that has taken over
         self._call: Call | None = None
-        self._calls = 0
         self._overdue = False  # a request to stop has not been answered in time
         self._closed = False
         self._hear, self._wake = os.pipe()
@@ -100,8 +98,7 @@ class Watchdog:
 
         @functools.wraps(function)
         def call(*arguments: Any) -> Any:
-            self._calls += 1
-            self._call = Call(self._calls, what, patience * self._timeout)
+            self._call = Call(what, patience * self._timeout)
             try:
                 if self._overdue:
                     threading.Event().wait()  # the watchdog is about to save and exit

@@ -42,8 +42,8 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
         drawn from the environment's `np_random`.
 
     Raises:
-      ConfigError: not a pixel environment, a sensor that does not fit its frames, an unknown name, or
-        a gaze that takes no visual actions.
+      ConfigError: not a pixel environment, a sensor that is none or does not fit its frames, an unknown name, or a gaze
+        that is none or takes no visual actions.
     """
 
     def __init__(self, env: gymnasium.Env, sensor: Sensor | str, gaze: GazeConfig | None = None) -> None:
@@ -54,6 +54,7 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
         self.action_space = self._eye.action_space(env.action_space)
         self._look = jax.jit(self._eye.look)
         self._focal_point = np.zeros(2, np.int32)
+        self._ended = False  # where the environment restarts by itself, the next step begins an episode
 
     @property
     def focal_point(self) -> np.ndarray:
@@ -63,17 +64,24 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begins an episode, with the focal point at the gaze's start."""
         frame, info = self.env.reset(seed=seed, options=options)
-        return self._observe(frame, 0, True), info
+        self._ended = False
+        return self._observe(frame, np.zeros((), np.int32), True), info
 
     def step(self, action: dict[str, Any]) -> tuple[dict, Any, bool, bool, dict]:
-        """Takes the natural action, moves the focal point and senses the new frame there."""
-        frame, reward, terminated, truncated, info = self.env.step(action["natural"])
-        return self._observe(frame, action["vision"], False), reward, terminated, truncated, info
+        """Takes the natural action, moves the focal point and senses the new frame there.
 
-    def _observe(self, frame: np.ndarray, vision_action: Any, is_first: bool) -> dict[str, np.ndarray]:
+        `ValueError` for what is not a visual action.
+        """
+        vision_action = self._eye.checked(action["vision"], ())
+        frame, reward, terminated, truncated, info = self.env.step(action["natural"])
+        observation = self._observe(frame, vision_action, self._ended)
+        self._ended = bool(terminated or truncated)
+        return observation, reward, terminated, truncated, info
+
+    def _observe(self, frame: np.ndarray, vision_action: np.ndarray, is_first: bool) -> dict[str, np.ndarray]:
         drawn = is_first and self._eye.gaze.start == "random"
         seed = self.env.unwrapped.np_random.integers(_SEEDS) if drawn else 0
-        arguments = self._focal_point, np.int32(vision_action), np.bool_(is_first), np.uint32(seed)
+        arguments = self._focal_point, vision_action, np.bool_(is_first), np.uint32(seed)
         observation, focal_point = self._look(self._eye.pixels(frame), *arguments)
         self._focal_point = np.array(focal_point)
         return {name: np.array(value) for name, value in observation.items()}
@@ -125,8 +133,9 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, Any, Any, Any, dict]:
         """A step of each; the one after an episode's last ignores its actions and begins the next."""
+        vision_action = self._eye.checked(actions["vision"], (self.num_envs,))
         frame, reward, terminated, truncated, info = self.env.step(actions["natural"])
-        observation = self._observe(frame, np.asarray(actions["vision"], np.int32), self._ended)
+        observation = self._observe(frame, vision_action, self._ended)
         self._ended = (terminated | truncated) & self._restarts
         return observation, reward, terminated, truncated, info
 
@@ -154,6 +163,10 @@ class _Eye:
             experiment = compose([f"experiment={sensor}"])
             sensor, gaze = experiment.sensor, gaze or dataclasses.replace(experiment.gaze, mode="learned")
         gaze = gaze or GazeConfig()
+        if not isinstance(sensor, Sensor):
+            raise ConfigError(f"sensor={sensor}: accepted is a RingSensor, a LogPolarSensor or an experiment's name")
+        if not isinstance(gaze, GazeConfig):
+            raise ConfigError(f"gaze={gaze}: accepted is a GazeConfig")
         if not gaze.learned:
             raise ConfigError(f"gaze.mode={gaze.mode}: accepted is learned, for visual actions from outside")
         # What a run is checked for, a wrapped environment is checked for too. But the whole frame may be a baseline
@@ -174,6 +187,15 @@ class _Eye:
     def action_space(self, natural: gymnasium.Space) -> gymnasium.Space:
         """Of one environment, whose own actions are `natural`."""
         return spaces.Dict({"natural": natural, "vision": spaces.Discrete(self.gaze.actions)})
+
+    def checked(self, vision_action: Any, shape: tuple[int, ...]) -> np.ndarray:
+        """Visual actions as they go to the device; `ValueError` where they are none."""
+        action = np.asarray(vision_action)
+        known = action.shape == shape and np.issubdtype(action.dtype, np.integer)
+        if not known or (action < 0).any() or (action >= self.gaze.actions).any():
+            accepted = f"integers {list(shape)} from 0 to {self.gaze.actions - 1}"
+            raise ValueError(f"vision={' '.join(str(action).split())[:80]}: accepted is {accepted}")
+        return action.astype(np.int32)
 
     @property
     def scale(self) -> float:

@@ -95,9 +95,13 @@ def test_a_shipped_agent_can_be_read_and_has_its_score(path):
 @pytest.mark.slow
 def test_a_shipped_agent_plays_as_well_as_it_says():
     stored = store.load_agent(demo.agents() / "pong-nonfoa")
-    arguments = stored.agent.config, stored.params, stored.statistics
-    games = evaluate.play(*arguments, episodes=2, num_envs=2, seed=0, greedy=False)
+    games = evaluate.play(stored, episodes=2, num_envs=2, seed=0, greedy=False)
     assert games.returns.mean() > 10
+
+
+def test_parameters_are_on_the_device(shipped):
+    stored = store.load_agent(shipped / "good")
+    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves((stored.params, stored.statistics)))
 
 
 def test_agents_are_beside_a_checkout():

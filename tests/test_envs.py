@@ -47,7 +47,7 @@ def breakout(request) -> SimpleNamespace:
     """200 random steps of 3 games of Breakout; FIRE, which serves, is left to the engine."""
     environment = envs.make(config(engine=request.param), num_envs=3, seed=0)
     assert (environment.num_envs, environment.num_actions) == (3, 4)
-    assert (environment.screen_shape, environment.crop_top) == ((210, 160), 34)
+    assert environment.crop_top == 34
     return play(environment, np.array([NOOP, RIGHT, LEFT])[random_actions(200, 3, 3)])
 
 
@@ -219,10 +219,13 @@ def test_games_go_by_either_name():
         ("pong", {"crop_top": {"default": 34, "pnog": 20}}, r"env.crop_top.pnog=20: accepted is default or an Atari"),
         ("gymnasium:Nowhere-v0", {}, r"game=gymnasium:Nowhere-v0: accepted is the id of an environment \(.*Nowhere"),
         ("gymnasium:no_such_module:X-v0", {}, r"game=gymnasium:no_such_module:X-v0: accepted is the id"),
+        ("gymnasium:Sized-v0", {}, r"game=gymnasium:Sized-v0: accepted is the id of an environment \(.*'shape'"),
         ("gymnasium:CartPole-v1", {}, r"game=gymnasium:CartPole-v1: accepted is .* uint8 images .*, not Box"),
     ],
 )
-def test_bad_input_is_one_clear_line(game, env, message):
+def test_bad_input_is_one_clear_line(game, env, message, monkeypatch):
+    sized = gymnasium.envs.registration.EnvSpec("Sized-v0", entry_point=Strict)  # without the shape that it needs
+    monkeypatch.setitem(gymnasium.registry, "Sized-v0", sized)
     with pytest.raises(ConfigError, match=f"^{message}[^\n]*$"):
         envs.make(config(game, **env), num_envs=1, seed=0)
 
@@ -315,7 +318,7 @@ def test_probes_show_what_they_should(name):
 @pytest.mark.parametrize("game", ["seek", "probe:memory"])
 def test_jax_environments_begin_anew_after_a_terminal(game):
     environment = envs.make(config(game), num_envs=8, seed=5)
-    assert (environment.num_actions, environment.screen_shape, environment.crop_top) == (2, (80, 80), None)
+    assert (environment.num_actions, environment.crop_top) == (2, None)
     run = play(environment, random_actions(200, 8, 2))
     assert run.is_terminal.sum() >= 16
     np.testing.assert_array_equal(run.is_over, run.is_terminal)
@@ -429,7 +432,7 @@ def reference_frame(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("shape", [(160, 240, 3), (80, 160, 1), (80, 80)])
 def test_gymnasium_images_become_gray_frames(pixels, shape):
     environment = envs.make(pixels(shape), num_envs=1, seed=0)
-    assert (environment.num_actions, environment.screen_shape, environment.crop_top) == (2, (80, 80), None)
+    assert (environment.num_actions, environment.crop_top) == (2, None)
     run = play(environment, np.zeros((3, 1)))
     reference = Pixels(shape)
     for reference.count in range(4):
@@ -494,6 +497,35 @@ def test_gymnasium_without_rendering_shows_its_images(shape):
     reference = Pixels(shape)
     reference.count = 0
     np.testing.assert_array_equal(screens[1], reference.image().reshape(*shape[:2], -1) + np.zeros(3, np.uint8))
+
+
+class Strict(Pixels):
+    """Says that it renders, and cannot be told to."""
+
+    def __init__(self, shape):
+        super().__init__(shape)
+
+
+def test_gymnasium_that_cannot_be_told_to_render_shows_its_images(monkeypatch):
+    spec = gymnasium.envs.registration.EnvSpec("Strict-v0", entry_point=Strict, kwargs={"shape": (8, 9)})
+    monkeypatch.setitem(gymnasium.registry, "Strict-v0", spec)
+    environment = envs.make(config("gymnasium:Strict-v0"), num_envs=2, seed=0, render=True)
+    environment.reset()
+    assert environment.render().shape == (2, 8, 9, 3)
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        np.zeros((1, 8, 8, 3), np.float32),
+        np.zeros((8, 9), np.uint8),
+        np.zeros((1, 3, 8, 8), np.uint8),
+        np.zeros((1, 8, 8, 4), np.uint8),
+    ],
+)
+def test_other_images_are_refused(images):
+    with pytest.raises(ValueError, match=r"^images=.*\]: accepted is uint8 \[B, h, w\], "):
+        gymnasium_env.gray_frames(images, (8, 8))
 
 
 @pytest.mark.parametrize(("source", "target"), [(160, 80), (210, 80), (96, 80), (50, 80), (80, 80)])

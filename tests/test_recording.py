@@ -9,6 +9,7 @@ import pytest
 from foajax import envs, evaluate
 from foajax.agent import Agent
 from foajax.compose import compose
+from foajax.config import ConfigError
 from foajax.evaluate import play
 from foajax.frames import to_frame
 from foajax.gaze import DIRECTIONS
@@ -75,8 +76,7 @@ def seeker(untrained):
 def test_a_game_is_the_one_that_evaluation_plays(seeker):
     games = list(record(seeker, episodes=2, seed=4))
     assert [len(game.screens) for game in games] == [97, 97] and all(game.is_over for game in games)
-    config = seeker.agent.config
-    scores = play(config, seeker.params, seeker.statistics, episodes=1, num_envs=1, seed=5, greedy=False)
+    scores = play(seeker, episodes=1, num_envs=1, seed=5, greedy=False)
     assert scores.returns[0] == pytest.approx(games[1].score[-1])
     assert scores.lengths[0] == len(games[1].screens) - 1  # the last screen ends it, nothing is done upon it
     assert games[0].vision_probs is None and games[0].vision_value is None and games[0].lives is None
@@ -135,9 +135,15 @@ class UnequalGames:
 
 def test_each_environment_plays_the_same_number_of_games(seeker, monkeypatch):
     monkeypatch.setattr(evaluate, "make", lambda *_, **__: UnequalGames())
-    arguments = seeker.agent.config, seeker.params, seeker.statistics
-    games = play(*arguments, episodes=4, num_envs=2, seed=0, greedy=False)
+    games = play(seeker, episodes=4, num_envs=2, seed=0, greedy=False)
     assert sorted(games.lengths) == sorted(games.returns) == [2, 2, 5, 5]
+
+
+def test_a_game_of_other_actions_is_refused(seeker):
+    other = seeker._replace(agent=Agent(seeker.agent.config, 3, None))
+    for watch in (lambda: next(record(other)), lambda: play(other, episodes=1, num_envs=1, seed=0, greedy=False)):
+        with pytest.raises(ConfigError, match="^game=seek: has 2 actions; accepted are 3, as in training$"):
+            watch()
 
 
 def test_a_recording_holds_what_the_sensor_gave(seeker):

@@ -8,6 +8,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import Autoreset
 
 from foajax.config import ConfigError, GazeConfig, RingSensor
 from foajax.wrapper import FoveatedObservation, FoveatedVectorObservation
@@ -158,6 +159,28 @@ def test_what_does_not_fit_is_refused_in_one_line(sensor, gaze, message):
     with pytest.raises(ConfigError, match=message) as error:
         FoveatedObservation(Noise(), sensor, gaze)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("action", [5, -1, 3.0, [3]])
+def test_what_is_no_visual_action_is_refused_before_the_step(action):
+    single, vector = FoveatedObservation(Noise(), FULL, GAZE), make_vector()
+    single.reset(seed=0)
+    vector.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^vision=.*: accepted is integers \[\] from 0 to 4$"):
+        single.step({"natural": 0, "vision": action})
+    with pytest.raises(ValueError, match=r"^vision=.*: accepted is integers \[2\] from 0 to 4$"):
+        vector.step({"natural": np.zeros(2, int), "vision": [action, action]})
+    assert single.unwrapped.time == 0
+
+
+def test_an_environment_that_restarts_by_itself_restarts_the_gaze():
+    env = FoveatedObservation(Autoreset(Noise(length=2)), FULL, GAZE)
+    env.reset(seed=0)
+    places = [env.focal_point]
+    for _ in range(4):
+        env.step({"natural": 0, "vision": RIGHT})
+        places.append(env.focal_point)
+    np.testing.assert_array_equal(np.stack(places) - [8, 10], [[0, 0], [0, 2], [0, 4], [0, 0], [0, 2]])
 
 
 def make_vector(lengths=(3, 5), gaze=GAZE, **options):
