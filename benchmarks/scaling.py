@@ -180,7 +180,15 @@ def allreduce(cores: Sequence[int]) -> dict[str, Any]:
     address = free_address()
     words = [[__file__, "part=member", f"coordinator={address}", f"process={i}"] for i in (0, 1)]
     members = [start(w, core=core) for core, w in zip(cores, words, strict=True)]
-    found["2 processes"] = [answer(m) for m in members][0]
+    try:
+        # One that fails leaves the other waiting.
+        while any(m.poll() is None for m in members) and not any(m.poll() for m in members):
+            time.sleep(0.1)
+        members.sort(key=lambda m: not m.returncode)  # it is asked first
+        found["2 processes"] = [answer(m) for m in members][0]
+    finally:
+        for m in members:
+            m.kill()
     return found
 
 
@@ -260,7 +268,11 @@ def main(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
     if options.part == "member":
-        print(json.dumps(member(options)))
+        try:
+            print(json.dumps(member(options)), flush=True)
+        except Exception as error:
+            print(" ".join(str(error).split()), flush=True)
+            os._exit(1)  # an orderly end would wait for the other one
         return
     import jaxlib
 

@@ -31,12 +31,13 @@ from jax.experimental import multihost_utils
 from jaxlib import _jax
 
 from foajax import coordinator
-from foajax.config import Config, ConfigError, check_address, check_shares
+from foajax.config import Config, ConfigError, check_address, check_shares, flatten, to_mapping
 
 T = TypeVar("T")
 
 EXIT_CODE = 75  # the system's "temporary failure": start the same command again
 _STARTING = 300  # seconds that processes wait for each other until all have started
+_OWN = ("run", "distributed.", "env.threads", "env.timeout")  # keys that each process may have its own value for
 _KEEPALIVE = 10  # times `distributed.timeout` until JAX's own watch ends a process: ours comes first
 
 
@@ -93,6 +94,20 @@ class Job:
         if self.is_first:
             client.key_value_set(f"foajax/{name}", text)
         return client.blocking_key_value_get(f"foajax/{name}", 1000 * _STARTING)
+
+    def agree(self, config: Config) -> None:
+        """`ConfigError`, in every process, unless all have been started with the same configuration."""
+        if self.count == 1:
+            return
+        settings = {key: value for key, value in flatten(to_mapping(config)) if not key.startswith(_OWN)}
+        first = json.loads(self.tell("configuration", json.dumps(settings)))
+        differ = [key for key in {**settings, **first} if settings.get(key) != first.get(key)]
+        others = np.flatnonzero(self.gather(np.array([bool(differ)])))
+        if differ:
+            key = differ[0]
+            raise ConfigError(f"{key}={settings.get(key)}: accepted is {first.get(key)}, as in process 0")
+        if others.size:
+            raise ConfigError(f"process {others[0]}: has another configuration; accepted is that of process 0")
 
     def by_first(self, name: str, task: Callable[[], T]) -> T | None:
         """What process 0 gets from `task`, None in the others; its `ConfigError` is raised in all."""
@@ -207,6 +222,7 @@ def leave(code: int) -> int:
     """The exit code of a process that fails alone; one of several ends here, as an orderly end would wait for them."""
     if jax.process_count() > 1:
         sys.stdout.flush()
+        sys.stderr.flush()
         os._exit(code)
     return code
 

@@ -53,7 +53,11 @@ def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: tuple, *, donate:
     """`program` on each device of a mesh, compiled; arrays from the host go to the devices that need them."""
     spread = jax.shard_map(program, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
     shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), inputs)
-    return jax.jit(spread, in_shardings=shardings, donate_argnums=donate)
+    compiled = jax.jit(spread, in_shardings=shardings, donate_argnums=donate)
+    if jax.process_count() > 1 and not mesh.is_multi_process:
+        # Where there are several processes, jit takes no host arrays for several devices.
+        return lambda *arguments: compiled(*jax.device_put(arguments, shardings))
+    return compiled
 
 
 def total_updates(agent: Agent) -> int:

@@ -23,11 +23,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from foajax import cli, cost, curves, heatmap
-from foajax.config import ConfigError, to_mapping
+from foajax.config import ConfigError, flatten, to_mapping
 from foajax.curves import RunData, read_run
 from foajax.heatmap import HeatMap
 from foajax.render import make_directory, play, progress_bar
-from foajax.rundir import FREE, flatten
+from foajax.rundir import FREE
 from foajax.scores import Interval, interval, iqm, normalised
 from foajax.status import newest_checkpoint
 from foajax.store import load_agent
@@ -321,13 +321,16 @@ def _make_map(run: RunData, episodes: int) -> HeatMap | None:
     except ConfigError as error:
         _note(f"no heat map: {error}")
         return None
-    directory = make_directory(run.path / "render")
     with progress_bar() as bar:
         games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
         heat = heatmap.heat_map([game._replace(images=()) for game in games])
-    there = heatmap.read(file) if (file := directory / heatmap.FILE).exists() else None
+    file = run.path / "render" / heatmap.FILE
+    there = heatmap.read(file) if file.exists() else None
     if there is None or (there.policy != "greedy" and there.whole_games is not False):  # others were made on purpose
-        heatmap.save(heat, directory, f"{run.config.name} on {run.config.game}")
+        try:
+            heatmap.save(heat, make_directory(file.parent), f"{run.config.name} on {run.config.game}")
+        except (ConfigError, OSError) as error:
+            _note(f"{file}: not kept ({error})")
     return heat
 
 
@@ -357,7 +360,11 @@ def report(arguments: Sequence[str]) -> None:
     if others := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:
         _note(f"preset={options.preset} leaves out {', '.join(others)}")
     make_directory(options.out)  # before games are played for what could not be written
-    print(build(games, find_maps(games, options.episodes), options))
+    maps = find_maps(games, options.episodes)
+    try:
+        print(build(games, maps, options))
+    except OSError as error:
+        raise ConfigError(f"out={options.out}: cannot be written ({error.strerror})") from None
 
 
 if __name__ == "__main__":

@@ -115,7 +115,9 @@ class Collector:
         """Goes on from what `get_state` gave."""
         for i, saved in enumerate(state):
             timestep, _ = self._environments[i].set_state(saved["environment"])
-            self.groups[i] = self.groups[i]._replace(timestep=timestep, actor_state=saved["actor"])
+            # On the host: how many devices share them may have changed.
+            actor_state = jax.tree.map(np.asarray, saved["actor"])
+            self.groups[i] = self.groups[i]._replace(timestep=timestep, actor_state=actor_state)
 
     def _act(self, i: int, acting: tuple, row: int, step: int) -> tuple[Array, ActorState]:
         group = self.groups[i]

@@ -22,14 +22,14 @@ import platform
 import socket
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from foajax import durable
-from foajax.config import Config, ConfigError, from_mapping, to_mapping
+from foajax.config import Config, ConfigError, flatten, from_mapping, to_mapping
 
 PARAMETERS = "agent.safetensors"  # of a shipped agent, which is no run
 _CONFIG = "config.yaml"
@@ -140,12 +140,12 @@ def load_config(path: str | os.PathLike[str]) -> Config:
       RunError: there is no such directory, it is no run, or its ``config.yaml`` cannot be read.
     """
     path = Path(path)
-    if not path.exists():
-        raise RunError(f"run={path}: does not exist; accepted is the directory of a run")
-    if not path.is_dir():
-        raise RunError(f"run={path}: is a file; accepted is the directory of a run")
     file = path / _CONFIG
     try:
+        if not path.exists():
+            raise RunError(f"run={path}: does not exist; accepted is the directory of a run")
+        if not path.is_dir():
+            raise RunError(f"run={path}: is a file; accepted is the directory of a run")
         mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
         if not isinstance(mapping, dict):
             raise ConfigError("is not the configuration of a run (no mapping)")
@@ -155,6 +155,8 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         config = from_mapping(mapping)
     except FileNotFoundError:
         raise RunError(f"run={path}: has no {_CONFIG}; accepted is the directory of a run") from None
+    except RunError:
+        raise
     except ConfigError as error:
         raise RunError(f"{file}: {error}") from None
     except OSError as error:
@@ -185,6 +187,12 @@ def note_failure(path: Path, why: str) -> None:
     """Keeps why this start of the run in `path` failed."""
     with contextlib.suppress(OSError):
         (path / _FAILURE).write_text(why + "\n", encoding="utf-8")
+
+
+def forget_failure(path: Path) -> None:
+    """The run in `path` is started again: what it failed of before is past."""
+    with contextlib.suppress(OSError):
+        (path / _FAILURE).unlink(missing_ok=True)
 
 
 def failure(path: Path) -> str | None:
@@ -273,15 +281,6 @@ def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
         return row if all(math.isfinite(row[key]) for key in ("env_steps", "time", *more)) else None
     except (ValueError, RecursionError, LookupError, TypeError, OverflowError):
         return None
-
-
-def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and their values."""
-    for key, value in mapping.items():
-        if isinstance(value, Mapping):
-            yield from flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _show(value: Any) -> str:

@@ -23,9 +23,9 @@ from safetensors.numpy import load_file, save_file
 from foajax import cli, durable
 from foajax.agent import Agent
 from foajax.checkpoint import Checkpoints
-from foajax.config import Config, ConfigError, to_mapping
+from foajax.config import Config, ConfigError, flatten, to_mapping
 from foajax.programs import make_state
-from foajax.rundir import PARAMETERS, flatten, is_run, load_config
+from foajax.rundir import PARAMETERS, is_run, load_config
 from foajax.types import FrameStatistics, Params, TrainState
 
 _FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration

@@ -20,10 +20,10 @@ from typing import NamedTuple
 
 from foajax import rundir, status
 from foajax.config import Config
+from foajax.watchdog import STOPS
 
 _POLL = 0.1  # seconds between two looks at the running processes
 _OUTPUT = "output.txt"  # of a run beside others, in its directory
-_PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
 class Run(NamedTuple):
@@ -37,12 +37,18 @@ class _Stop:
     """Passes signals on to the running processes and remembers that there was one."""
 
     def __init__(self) -> None:
-        self.requested = False
+        self.requested: int | None = None  # the signal
         self.processes: dict[str, subprocess.Popen] = {}  # by run directory
+
+    def add(self, directory: str, process: subprocess.Popen) -> None:
+        """A process that has been started; what came meanwhile is passed on to it."""
+        self.processes[directory] = process
+        if self.requested is not None:
+            process.send_signal(self.requested)
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
-        before = {number: signal.signal(number, self._pass_on) for number in _PASSED_ON}
+        before = {number: signal.signal(number, self._pass_on) for number in STOPS}
         try:
             yield
         finally:
@@ -50,7 +56,7 @@ class _Stop:
                 signal.signal(number, handler)
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
+        self.requested = number
         for process in self.processes.values():
             if process.poll() is None:
                 process.send_signal(number)
@@ -75,7 +81,8 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.exe
                 taken[run.config.run_dir] = cores = shares.popleft()
                 try:
                     with _on(cores):
-                        stop.processes[run.config.run_dir] = _start(run, command, alone=jobs == 1)
+                        process = _start(run, command, alone=jobs == 1)
+                    stop.add(run.config.run_dir, process)
                 except OSError as error:
                     shares.append(taken.pop(run.config.run_dir))
                     failures[run.config.run_dir] = f"cannot be started ({error})"
@@ -85,8 +92,9 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.exe
                     del stop.processes[directory]
                     shares.append(taken.pop(directory))
                     # Whoever is told to stop before it can save is not at fault.
-                    if code and not (stop.requested and -code in _PASSED_ON):
-                        failures[directory] = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit {code}"
+                    if code and not (stop.requested and -code in STOPS):
+                        ended = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit {code}"
+                        failures[directory] = ended if jobs == 1 else f"{ended} (see {_OUTPUT} there)"
     return summarise([run.config for run in runs], failures)
 
 
@@ -145,6 +153,7 @@ def _on(cores: set[int]) -> Iterator[None]:
 
 def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen:
     # In a process group of its own: the terminal's Ctrl-C comes once, from us.
+    rundir.forget_failure(Path(run.config.run_dir))
     words = [*command, *run.words]
     if alone:
         return subprocess.Popen(words, process_group=0)

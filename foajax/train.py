@@ -8,6 +8,7 @@ import math
 import signal
 import sys
 import time
+import traceback
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -78,7 +79,9 @@ class Run:
         self._tracker = EpisodeTracker(config.env.num_envs)
         state = make_state(agent, config.seed)
         if config.train.init_from is not None and not self._env_steps:
-            state = begin_from(config.train.init_from, state, config)
+            path = config.train.init_from
+            begun = job.by_first("parameters", lambda: begin_from(path, state, config))
+            state = job.share(state if begun is None else begun)
         self._state = self._on_all_devices(state)
         self._stop_agreed = False
         self._kept: tuple[int, dict[str, Any], dict[str, Any]] | None = None
@@ -384,6 +387,14 @@ def train(config: Config) -> int:
         _train(config)
     except EnvironmentFault as fault:
         return distributed.leave(report_fault(config, str(fault), fault))
+    except Exception as error:
+        if jax.process_count() == 1:
+            raise
+        if isinstance(error, ConfigError):
+            print(f"foajax: error: {error}", file=sys.stderr, flush=True)
+            return distributed.leave(2)
+        traceback.print_exc()
+        return distributed.leave(1)
     return 0
 
 
@@ -402,6 +413,7 @@ def _train(config: Config) -> None:
             profiling.profile(config, environments, f"{config.run_dir}/profile")
             return
         job = distributed.start(config)
+        job.agree(config)
         if config.train.dump_skipped and len(job.devices) > 1:
             raise ConfigError("train.dump_skipped=true: accepted is false where a run has several devices")
         stop = StopRequest()

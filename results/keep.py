@@ -20,11 +20,11 @@ import yaml
 
 from foajax import cli
 from foajax.compose import compose
-from foajax.config import ConfigError, to_mapping
+from foajax.config import ConfigError, flatten, to_mapping
 from foajax.curves import RunData, colours_of, draw_curves, read_run
 from foajax.foveation import pixel_count
 from foajax.report import games_of
-from foajax.rundir import FREE, flatten, load_config
+from foajax.rundir import FREE, load_config
 
 KEPT = Path(__file__).parent / "runs"
 _ROWS = 500

@@ -43,13 +43,17 @@ def start(*words, **variables):
     return processes.start(*WORDS, *words, env=environment | variables)
 
 
-def start_job(count, *words, last=None):
-    """`count` processes on this machine that find each other at a free port; the last one has variables of its own."""
+def start_job(count, *words, last=None, others=()):
+    """`count` processes on this machine that find each other at a free port.
+
+    The last one has variables of its own; all but the first have `others`, words of their own.
+    """
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     where = [f"distributed.coordinator=127.0.0.1:{port}", f"distributed.processes={count}"]
     variables = [{}] * (count - 1) + [last or {}]
-    return [start(*words, *where, f"distributed.process={i}", **variables[i]) for i in range(count)]
+    own = [(), *[others] * (count - 1)]
+    return [start(*words, *own[i], *where, f"distributed.process={i}", **variables[i]) for i in range(count)]
 
 
 def finish(*started):
@@ -94,14 +98,35 @@ def two(tmp_path_factory):
     return run
 
 
-def test_four_devices_learn_what_one_learns(one, tmp_path):
-    words = [f"run={tmp_path}", f"train.env_steps={TWENTY_UPDATES}", "train.devices=4"]
-    finish(start(*words, JAX_NUM_CPU_DEVICES="4"))
+def test_four_devices_and_then_two_learn_what_one_learns(one, tmp_path):
+    for devices, env_steps in ((4, TWENTY_UPDATES // 2), (2, TWENTY_UPDATES)):
+        words = [f"run={tmp_path}", f"train.env_steps={env_steps}", f"train.devices={devices}"]
+        (out,) = finish(start(*words, JAX_NUM_CPU_DEVICES="4"))
+    assert "resumed at 384 env_steps (episodes go on)" in out
     assert_same(tmp_path, one)
 
 
 def test_two_processes_learn_what_one_learns(one, two):
     assert_same(two, one)
+
+
+def test_two_processes_of_two_devices_learn_what_one_learns(one, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "2")
+    finish(*start_job(2, f"run={tmp_path}", f"train.env_steps={TWENTY_UPDATES}", "train.devices=2"))
+    assert_same(tmp_path, one)
+
+
+def test_processes_of_different_configurations_are_refused(tmp_path):
+    """All of them and at once: an orderly end would wait for the other one."""
+    begin = time.monotonic()
+    words = [f"run={tmp_path / 'run'}", "train.env_steps=640"]
+    started = start_job(2, *words, others=["learner.learning_rate=0.5", "env.threads=2"])
+    errors = [process.communicate(timeout=120)[1] for process in started]
+    assert [process.returncode for process in started] == [2, 2], errors
+    first, second = (error.splitlines()[-1] for error in errors)
+    assert first == "foajax: error: process 1: has another configuration; accepted is that of process 0"
+    assert second == "foajax: error: learner.learning_rate=0.5: accepted is 0.001, as in process 0"
+    assert time.monotonic() - begin < 90 and not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

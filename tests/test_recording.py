@@ -110,8 +110,6 @@ def test_a_greedy_game_takes_the_likeliest_actions(breakout_agent):
 class UnequalGames:
     """Two environments: one whose games last 2 steps, one whose games last 5."""
 
-    num_actions, crop_top = 2, None
-
     def reset(self):
         self._age = np.zeros(2, int)
         return self._seen(np.ones(2, bool)), None
@@ -134,7 +132,7 @@ class UnequalGames:
 
 
 def test_each_environment_plays_the_same_number_of_games(seeker, monkeypatch):
-    monkeypatch.setattr(evaluate, "make", lambda *_, **__: UnequalGames())
+    monkeypatch.setattr(evaluate, "environment", lambda *_, **__: UnequalGames())
     games = play(seeker, episodes=4, num_envs=2, seed=0, greedy=False)
     assert sorted(games.lengths) == sorted(games.returns) == [2, 2, 5, 5]
 

@@ -35,7 +35,9 @@ if what == "finish":
     (directory / "checkpoints" / "100").mkdir(parents=True)
 if what == "kill":
     os.kill(os.getpid(), signal.SIGKILL)
-sys.exit(3 if what == "fail" else 0)
+if what == "fail":
+    (directory / "failure.txt").write_text("game=x: accepted is a game")
+sys.exit({"fail": 3, "refuse": 2}.get(what, 0))
 """
 COMMAND = (sys.executable, "-c", STAND_IN)
 
@@ -110,13 +112,32 @@ def test_what_is_finished_is_not_started(make, capfd):
 
 def test_a_failure_is_listed_in_the_end_and_the_others_run(make, capfd):
     runs = [make("a", "fail"), make("b", "kill"), make("c", "finish"), make("d", "end")]
-    (Path(runs[0].config.run_dir) / "failure.txt").write_text("game=x: accepted is a game\n")
     assert sweep.run_all(runs, jobs=1, command=COMMAND) == 1
     *_, counts, first, second, third = capfd.readouterr().err.splitlines()
     assert counts.startswith("sweep of 4 runs: 1 finished, 1 unfinished, 2 failed")
     assert first.endswith("a: exit 3: game=x: accepted is a game") and first.startswith("  failed: ")
     assert second.endswith("b: killed by SIGKILL")
     assert third.startswith("  unfinished: ") and third.endswith("/d")
+
+
+def test_what_a_run_failed_of_before_is_not_why_it_is_refused(make, capfd):
+    run = make("a", "refuse")
+    (Path(run.config.run_dir) / "failure.txt").write_text("game=x: accepted is a game\n")
+    for jobs, said in ((1, "a: exit 2"), (2, "a: exit 2 (see output.txt there)")):
+        assert sweep.run_all([run], jobs=jobs, command=COMMAND) == 1
+        assert capfd.readouterr().err.endswith(said + "\n")
+
+
+def test_a_signal_reaches_the_run_that_is_being_started(make, monkeypatch):
+    def start(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGTERM)  # before the sweep knows of the process
+        return begin(*arguments, **options)
+
+    begin = sweep._start
+    monkeypatch.setattr(sweep, "_start", start)
+    begun = time.monotonic()
+    assert sweep.run_all([make("a", "wait"), make("b", "finish")], jobs=1, command=COMMAND) == 0
+    assert time.monotonic() - begun < 30
 
 
 def test_a_run_of_another_meaning_is_not_taken_for_finished(make, tmp_path):
