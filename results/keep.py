@@ -119,6 +119,8 @@ def main(arguments: Sequence[str]) -> None:
     intro = (
         "Score: mean and standard error over 30 whole games, unclipped, sampled policy, of the last checkpoint. Some\n"
         "were stopped before their `train.env_steps`. Each `run.json` has the command, the commit and the machine.\n"
+        "Steps and hours, here and in the curves, do not count those of an agent that a run began from\n"
+        "(`train.init_from` in its command).\n"
         "Made by `results/keep.py`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
