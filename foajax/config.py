@@ -22,10 +22,11 @@ class ConfigError(ValueError):
 
 def _check(ok: bool, key: str, value: object, accepted: str) -> None:
     if not ok:
-        raise ConfigError(f"{key}={_show(value)}: accepted is {accepted}")
+        raise ConfigError(f"{key}={brief(value)}: accepted is {accepted}")
 
 
-def _show(value: object) -> str:
+def brief(value: object) -> str:
+    """A value in one line, of 80 characters at most."""
     text = str(list(value)) if isinstance(value, tuple) else str(value)
     text = " ".join(text.split())
     return text if len(text) <= 80 else text[:77] + "..."
@@ -405,14 +406,14 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 def build(cls: Any, value: Any, key: str) -> Any:
     """A dataclass from a mapping, every field converted to its annotated type."""
     if not isinstance(value, Mapping):
-        raise ConfigError(f"{key or 'config'}={_show(value)}: accepted is a mapping")
+        raise ConfigError(f"{key or 'config'}={brief(value)}: accepted is a mapping")
     hints = typing.get_type_hints(cls)
     names = [f.name for f in dataclasses.fields(cls)]
     prefix = f"{key}." if key else ""
     for name in value:
         if name not in names:
             raise ConfigError(
-                f"{prefix}{_show(name)}={_show(value[name])}: unknown key; accepted are {', '.join(names)}"
+                f"{prefix}{brief(name)}={brief(value[name])}: unknown key; accepted are {', '.join(names)}"
             )
     for field in dataclasses.fields(cls):
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
@@ -432,7 +433,7 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
         kind = value.get("kind", "rings") if isinstance(value, Mapping) else None
         kinds = {"rings": RingSensor, "logpolar": LogPolarSensor}
         if isinstance(value, Mapping) and not (isinstance(kind, str) and kind in kinds):
-            raise ConfigError(f"{key}.kind={_show(kind)}: accepted is one of {', '.join(kinds)}")
+            raise ConfigError(f"{key}.kind={brief(kind)}: accepted is one of {', '.join(kinds)}")
         return build(kinds.get(str(kind), RingSensor), value, key)
     if origin in (typing.Union, types.UnionType):
         for option in args:
@@ -440,10 +441,10 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
                 return _convert(option, value, key)
             except ConfigError:
                 continue
-        raise ConfigError(f"{key}={_show(value)}: accepted is {describe(hint)}")
+        raise ConfigError(f"{key}={brief(value)}: accepted is {describe(hint)}")
     if dataclasses.is_dataclass(hint):
         return build(hint, value, key)
-    accepted = ConfigError(f"{key}={_show(value)}: accepted is {describe(hint)}")
+    accepted = ConfigError(f"{key}={brief(value)}: accepted is {describe(hint)}")
     if origin is Literal:
         for option in args:
             if type(option) is type(value) and option == value:

@@ -6,7 +6,6 @@ actions are an emulator's. An id may name the module that registers it, e.g. `gy
 
 from __future__ import annotations
 
-import contextlib
 import functools
 
 import gymnasium
@@ -15,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from foajax.config import Config, ConfigError
+from foajax.config import Config, ConfigError, brief
 from foajax.types import Outcome, TimeStep
 
 LUMA = np.array([299, 587, 114])  # thousandths of red, green and blue in gray (ITU-R BT.601)
@@ -28,13 +27,16 @@ class GymnasiumEnvironment:
     lives: np.ndarray | None = None
 
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
-        name = config.game.removeprefix("gymnasium:")
+        make = functools.partial(gymnasium.make, config.game.removeprefix("gymnasium:"), disable_env_checker=True)
 
         def make_one() -> gymnasium.Env:
-            env = gymnasium.make(name, disable_env_checker=True)
+            env = make()
             if render and "rgb_array" in (env.metadata.get("render_modes") or ()):
-                with contextlib.suppress(TypeError):  # it may not take the argument
-                    env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)
+                env.close()
+                try:
+                    env = make(render_mode="rgb_array")
+                except TypeError:  # it does not take the argument
+                    env = make()
             return TimeLimit(env, config.env.max_episode_steps)  # beside a limit of its own
 
         try:
@@ -45,10 +47,9 @@ class GymnasiumEnvironment:
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
         if not (is_pixels and isinstance(actions, spaces.Discrete)):
-            has = " and ".join(" ".join(str(space).split())[:80] for space in (observations, actions))
             raise ConfigError(
                 f"game={config.game}: accepted is an environment with discrete actions and uint8 images "
-                f"[h, w], [h, w, 1] or [h, w, 3], not {has}"
+                f"[h, w], [h, w, 1] or [h, w, 3], not {brief(observations)} and {brief(actions)}"
             )
         self.num_envs, self.num_actions = num_envs, int(actions.n)
         self._shape = config.env.frame_shape

@@ -142,10 +142,6 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     path = Path(path)
     file = path / _CONFIG
     try:
-        if not path.exists():
-            raise RunError(f"run={path}: does not exist; accepted is the directory of a run")
-        if not path.is_dir():
-            raise RunError(f"run={path}: is a file; accepted is the directory of a run")
         mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
         if not isinstance(mapping, dict):
             raise ConfigError("is not the configuration of a run (no mapping)")
@@ -153,10 +149,10 @@ def load_config(path: str | os.PathLike[str]) -> Config:
             if isinstance(mapping.get(group), dict):
                 mapping[group] = before | mapping[group]
         config = from_mapping(mapping)
-    except FileNotFoundError:
-        raise RunError(f"run={path}: has no {_CONFIG}; accepted is the directory of a run") from None
-    except RunError:
-        raise
+    except (FileNotFoundError, NotADirectoryError):
+        there = f"has no {_CONFIG}" if os.path.isdir(path) else "is a file"
+        what = there if os.path.exists(path) else "does not exist"
+        raise RunError(f"run={path}: {what}; accepted is the directory of a run") from None
     except ConfigError as error:
         raise RunError(f"{file}: {error}") from None
     except OSError as error:

@@ -388,7 +388,7 @@ def train(config: Config) -> int:
     except EnvironmentFault as fault:
         return distributed.leave(report_fault(config, str(fault), fault))
     except Exception as error:
-        if jax.process_count() == 1:
+        if not jax.distributed.is_initialized():
             raise
         if isinstance(error, ConfigError):
             print(f"foajax: error: {error}", file=sys.stderr, flush=True)

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Num, UInt32
 
 from foajax import gaze as gazes
 from foajax.compose import compose
-from foajax.config import Config, ConfigError, EnvConfig, GazeConfig, Sensor
+from foajax.config import Config, ConfigError, EnvConfig, GazeConfig, Sensor, brief
 from foajax.foveation import image_shapes, sense
 
 _SEEDS = 2**32
@@ -194,7 +194,7 @@ class _Eye:
         known = action.shape == shape and np.issubdtype(action.dtype, np.integer)
         if not known or (action < 0).any() or (action >= self.gaze.actions).any():
             accepted = f"integers {list(shape)} from 0 to {self.gaze.actions - 1}"
-            raise ValueError(f"vision={' '.join(str(action).split())[:80]}: accepted is {accepted}")
+            raise ValueError(f"vision={brief(action)}: accepted is {accepted}")
         return action.astype(np.int32)
 
     @property
@@ -241,4 +241,4 @@ def _pixels(space: gymnasium.Space) -> spaces.Box:
         if number and (len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[2] in (1, 3))):
             return space
     accepted = "a Box of uint8 or float pixels, [H, W], [H, W, 1] or [H, W, 3]"
-    raise ConfigError(f"observation_space={' '.join(str(space).split())[:80]}: accepted is {accepted}")
+    raise ConfigError(f"observation_space={brief(space)}: accepted is {accepted}")
