@@ -8,6 +8,8 @@ images at a time. Both forms compute the same numbers; which one is used is sett
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -39,68 +41,73 @@ def convolve_plain(x: Array, kernel: Array, stride: int) -> Array:
 
 
 def _convolve_cpu(x: Array, kernel: Array, stride: int) -> Array:
-    if stride > 1:
-        # Kernel and stride of a block are 1: fewer and longer slices to copy. Zeros complete a kernel's last blocks.
-        rows, columns = ((0, -size % stride) for size in kernel.shape[:2])
-        x, kernel = jnp.pad(x, ((0, 0), rows, columns, (0, 0))), jnp.pad(kernel, (rows, columns, (0, 0), (0, 0)))
-        height, width = kernel.shape[:2]
-        x, kernel = _fold_image(x, height, width, stride), _fold_kernel(kernel, stride)
-    return _patch_convolution(x, kernel)
+    if extra := -kernel.shape[1] % stride:
+        # Zeros make the kernel's width a whole number of strides.
+        x = jnp.pad(x, ((0, 0), (0, 0), (0, extra), (0, 0)))
+        kernel = jnp.pad(kernel, ((0, 0), (0, extra), (0, 0), (0, 0)))
+    return _patch_convolution(stride, x, kernel)
 
 
-def _fold_image(x: Array, height: int, width: int, stride: int) -> Array:
-    """Space to depth: blocks of stride x stride pixels become channels. Unreached borders are cut."""
-    n, rows, columns, channels = x.shape
-    rows = (rows - height) // stride * stride + height
-    columns = (columns - width) // stride * stride + width
-    x = x[:, :rows, :columns].reshape(n, rows // stride, stride, columns // stride, stride, channels)
-    return x.transpose(0, 1, 3, 2, 4, 5).reshape(n, rows // stride, columns // stride, stride * stride * channels)
+def _patches(x: Array, height: int, width: int, stride: int) -> Array:
+    """All patches as rows, [N*h*w, height*width*C]: first the columns of each are put together, then its rows."""
+    h, w = _number(x, height, width, stride)
+    blocks = _blocks(x, w, width, stride)
+    x = jnp.stack([blocks[:, :, j : j + w] for j in range(width // stride)], axis=3)
+    x = x.reshape(*x.shape[:3], -1)
+    slices = [x[:, i : i + stride * (h - 1) + 1 : stride] for i in range(height)]
+    return jnp.stack(slices, axis=3).reshape(x.shape[0] * h * w, -1)
 
 
-def _fold_kernel(kernel: Array, stride: int) -> Array:
-    height, width, channels, features = kernel.shape
-    kernel = kernel.reshape(height // stride, stride, width // stride, stride, channels, features)
-    kernel = kernel.transpose(0, 2, 1, 3, 4, 5)
-    return kernel.reshape(height // stride, width // stride, stride * stride * channels, features)
+def _patches_at_once(x: Array, height: int, width: int, stride: int) -> Array:
+    """The same in one step: up to 1.4 times slower, but its transpose up to 3 times faster."""
+    h, w = _number(x, height, width, stride)
+    blocks = _blocks(x, w, width, stride)
+    down, across = range(height), range(width // stride)
+    slices = [blocks[:, i : i + stride * (h - 1) + 1 : stride, j : j + w] for i in down for j in across]
+    return jnp.stack(slices, axis=3).reshape(x.shape[0] * h * w, -1)
 
 
-def _patches(x: Array, height: int, width: int) -> Array:
-    """All patches, one a pixel, as rows: [N*h*w, height*width*C]. Stacking is many times faster than concatenating."""
-    n, rows, columns, channels = x.shape
-    h, w = rows - height + 1, columns - width + 1
-    slices = [x[:, i : i + h, j : j + w] for i in range(height) for j in range(width)]
-    return jnp.stack(slices, axis=3).reshape(n * h * w, height * width * channels)
+def _number(x: Array, height: int, width: int, stride: int) -> tuple[int, int]:
+    """Patches of an image, down and across."""
+    return (x.shape[1] - height) // stride + 1, (x.shape[2] - width) // stride + 1
 
 
-@jax.custom_vjp
-def _patch_convolution(x: Array, kernel: Array) -> Array:
-    return _patch_forward(x, kernel)[0]
+def _blocks(x: Array, across: int, width: int, stride: int) -> Array:
+    """Rows in blocks of `stride` pixels, [N, H, blocks, stride*C]: fewer and longer slices to copy."""
+    n, rows, _, channels = x.shape
+    blocks = across - 1 + width // stride
+    return x[:, :, : blocks * stride].reshape(n, rows, blocks, stride * channels)
 
 
-def _patch_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array, Array | None]]:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _patch_convolution(stride: int, x: Array, kernel: Array) -> Array:
+    return _patch_forward(stride, x, kernel)[0]
+
+
+def _patch_forward(stride: int, x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array, Array | None]]:
     height, width, _, features = kernel.shape
-    h, w = x.shape[1] - height + 1, x.shape[2] - width + 1
+    h, w = _number(x, height, width, stride)
     flat = kernel.reshape(-1, features)
     part = _images_at_once(x, h * w * flat.shape[0])
     patches = None
     if part == x.shape[0]:
-        patches = _patches(x, height, width)
+        patches = _patches(x, height, width, stride)
         y = patches @ flat
     else:
-        y = jax.lax.map(lambda images: _patches(images, height, width) @ flat, _split(x, part))
+        y = jax.lax.map(lambda images: _patches(images, height, width, stride) @ flat, _split(x, part))
     return y.reshape(x.shape[0], h, w, features), (x, kernel, patches)
 
 
-def _patch_backward(residuals: tuple[Array, Array, Array | None], dy: Array) -> tuple[Array, Array]:
+def _patch_backward(stride: int, residuals: tuple[Array, Array, Array | None], dy: Array) -> tuple[Array, Array]:
     x, kernel, patches = residuals
-    height, width, channels, features = kernel.shape
+    height, width, _, features = kernel.shape
     flat = kernel.reshape(-1, features)
 
     def gradients(images: Array, dy: Array, patches: Array) -> tuple[Array, Array]:
         dy = dy.reshape(-1, features)
         # The transposed product is the faster one of the two: the long axis is contracted with the few features first.
         dkernel = dy.T @ patches
-        (dx,) = jax.linear_transpose(lambda x: _patches(x, height, width), images)(dy @ flat.T)
+        (dx,) = jax.linear_transpose(lambda x: _patches_at_once(x, height, width, stride), images)(dy @ flat.T)
         return dkernel, dx
 
     if patches is not None:
@@ -110,7 +117,7 @@ def _patch_backward(residuals: tuple[Array, Array, Array | None], dy: Array) -> 
     def add(total: Array, part: tuple[Array, Array]) -> tuple[Array, Array]:
         images, dy = part
         # Made again: that is faster than to fetch them from memory.
-        dkernel, dx = gradients(images, dy, _patches(images, height, width))
+        dkernel, dx = gradients(images, dy, _patches(images, height, width, stride))
         return total + dkernel, dx
 
     part = _images_at_once(x, dy.shape[1] * dy.shape[2] * flat.shape[0])

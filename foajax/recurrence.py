@@ -47,13 +47,15 @@ def _forward(projected: Array, kernel: Array, keep: Array, cell: Array, hidden: 
         new_hidden = o * squashed
         return (new_cell, new_hidden), (new_hidden, (i, f, g, o, cell, hidden, squashed))
 
-    (cell, hidden), (hiddens, saved) = jax.lax.scan(step, (cell, hidden), (projected, keep), unroll=_unroll(projected))
+    (cell, hidden), (hiddens, saved) = jax.lax.scan(step, (cell, hidden), (projected, keep))
     return (hiddens, cell, hidden), (kernel, keep, saved)
 
 
 def _backward(residuals, gradients):
     kernel, keep, saved = residuals
     dhiddens, dcell, dhidden = gradients
+    # Transposed once: XLA would move it into the loop, and read the kernel the wrong way round at each step.
+    transposed = jax.lax.optimization_barrier(kernel.T)
 
     def step(carry, inputs):
         dcell, dhidden = carry
@@ -69,11 +71,9 @@ def _backward(residuals, gradients):
             ],
             axis=-1,
         )
-        return (dcell * f * keep[:, None], (dgates @ kernel.T) * keep[:, None]), dgates
+        return (dcell * f * keep[:, None], (dgates @ transposed) * keep[:, None]), dgates
 
-    (dcell, dhidden), dgates = jax.lax.scan(
-        step, (dcell, dhidden), (dhiddens, keep, saved), reverse=True, unroll=_unroll(dhiddens)
-    )
+    (dcell, dhidden), dgates = jax.lax.scan(step, (dcell, dhidden), (dhiddens, keep, saved), reverse=True)
     hiddens = saved[5]
     width = hiddens.shape[-1]
     dkernel = hiddens.reshape(-1, width).T @ dgates.reshape(-1, 4 * width)
@@ -81,8 +81,3 @@ def _backward(residuals, gradients):
 
 
 _lstm.defvjp(_forward, _backward)
-
-
-def _unroll(x: Array) -> int:
-    """A short loop costs more than its body on the CPU: write it out."""
-    return x.shape[0] if x.shape[0] <= 32 else 1

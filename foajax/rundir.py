@@ -1,7 +1,7 @@
 """A run's directory: held by one process at a time, and for one meaning of the configuration.
 
     config.yaml   the resolved configuration
-    run.json      every start: command, versions, commit, machine, time
+    run.json      every start: command, versions, commit, machine, devices, time
     lock          locked by the process that trains; names it
     failure.txt   why the last start failed, where it did
 
@@ -87,7 +87,7 @@ class RunDir:
         self.close()
 
 
-def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
+def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] = ()) -> RunDir:
     """Creates or reopens ``config.run_dir`` and holds it.
 
     The lock is the kernel's: it ends with the process, however that ends. ``config.yaml`` is written, or
@@ -97,6 +97,7 @@ def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
     Args:
       config: the run that is asked for.
       command: the words that started this process, for the record.
+      devices: the kinds of the run's devices, for the record.
 
     Raises:
       RunError: the directory cannot be created, written or read, is in use, or holds another run or a shipped agent.
@@ -114,7 +115,7 @@ def open_run(config: Config, *, command: Sequence[str]) -> RunDir:
     run_dir = RunDir(path, _take_lock(path))
     try:
         _settle_config(path, config)
-        _record_start(path, command)
+        _record_start(path, command, devices)
         (path / _FAILURE).unlink(missing_ok=True)
     except OSError as error:
         run_dir.close()
@@ -283,17 +284,17 @@ def _show(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _record_start(path: Path, command: Sequence[str]) -> None:
+def _record_start(path: Path, command: Sequence[str], devices: Sequence[str]) -> None:
     file = path / _RECORD
     try:
         record = json.loads(file.read_text(encoding="utf-8")) if os.path.lexists(file) else {"starts": []}
-        record["starts"].append(_describe_start(command))
+        record["starts"].append(_describe_start(command, devices))
     except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
         raise RunError(f"{file}: is not the record of a run; move it away") from None
     durable.replace(file, (json.dumps(record, indent=1) + "\n").encode())
 
 
-def _describe_start(command: Sequence[str]) -> dict[str, Any]:
+def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str, Any]:
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": list(command),
@@ -306,6 +307,7 @@ def _describe_start(command: Sequence[str]) -> dict[str, Any]:
         "system": platform.platform(),
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "devices": list(devices),
     }
 
 

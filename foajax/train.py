@@ -418,7 +418,10 @@ def _train(config: Config) -> None:
             raise ConfigError("train.dump_skipped=true: accepted is false where a run has several devices")
         stop = StopRequest()
         command = [sys.executable, *sys.argv]
-        run_dir = job.by_first("run", lambda: resources.enter_context(open_run(config, command=command)))
+        devices = [device.device_kind for device in job.devices]
+        run_dir = job.by_first(
+            "run", lambda: resources.enter_context(open_run(config, command=command, devices=devices))
+        )
         try:
             run = Run(config, job, run_dir, resources)
         except OSError as error:  # its files: whatever an environment raises is a fault of its own

@@ -28,7 +28,7 @@ from foajax.rundir import FREE, load_config
 
 KEPT = Path(__file__).parent / "runs"
 _ROWS = 500
-_MACHINE = ("cpu", "cores", "system", "python", "packages")
+_MACHINE = ("cpu", "cores", "devices", "system", "python", "packages")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _facts(run: RunData) -> dict[str, Any]:
         "seed": run.config.seed,
         "env_steps": int(run.env_steps[-1]),
         "hours": round(float(run.time[-1]) / 3600, 2),
-        **{key: starts[-1][key] for key in _MACHINE},
+        **{key: starts[-1][key] for key in _MACHINE if key in starts[-1]},  # older runs do not name their devices
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports jax
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
 
 import jax
 import numpy as np

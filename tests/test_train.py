@@ -43,7 +43,8 @@ def test_a_run_leaves_everything_that_it_promises(breakout):
     events = b"".join(file.read_bytes() for file in (run / "tensorboard").iterdir())
     assert events.count(b"gaze/heat_map") == events.count(b"gaze/views") == 1  # the first one; the next is due later
     assert sorted(int(p.name) for p in (run / "checkpoints").iterdir())[-1] == 1000
-    assert json.loads((run / "run.json").read_text())["starts"][0]["packages"]["envpool"]
+    (start,) = json.loads((run / "run.json").read_text())["starts"]
+    assert start["packages"]["envpool"] and start["devices"] == ["cpu"]
 
 
 def test_the_same_seed_gives_the_same_hundred_updates_on_the_emulators_too(breakout, tmp_path):
