@@ -4,13 +4,15 @@
 
 Torso, dense layer, LSTM over T+1 = 21 steps (reset where episodes start) and the heads, on the same random images,
 with the same parameters (the outputs are compared first); `update` is the whole step: A2C loss of both heads, its
-gradient, clipping and Adam with AMSGrad. Both sides run in this process, in turns, with all its cores. Speeds are
-medians, in steps/s. Needs PyTorch (`pip install torch`), which foajax itself does not use. Run it on an idle machine.
+gradient, clipping and Adam with AMSGrad, as PyTorch has it by default and (`update_fused`) fused. Both sides run in
+this process, in turns, with all its cores. Speeds are medians, in steps/s. Needs PyTorch (`pip install torch`), which
+foajax itself does not use. Run it on an idle machine.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import platform
 import statistics
@@ -35,6 +37,7 @@ from foajax.types import CoreState, NetworkOutput
 
 STEPS = 21  # T + 1
 ACTIONS = 4
+PARTS = ("forward", "forward_backward", "update", "update_fused")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,7 +180,10 @@ def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
     point = torch.tensor(unit.reshape(-1, 2)) if agent.network.sees_focal_point else None
     keep = torch.tensor(1.0 - is_first[..., None].astype(np.float32))
     state = (torch.zeros(batch, width), torch.zeros(batch, width))
-    adam = torch.optim.Adam(leaves, lr=config.learner.learning_rate, eps=config.learner.adam_eps, amsgrad=True)
+
+    def adam(*, fused: bool) -> Any:
+        rate, eps = config.learner.learning_rate, config.learner.adam_eps
+        return torch.optim.Adam(leaves, lr=rate, eps=eps, amsgrad=True, fused=fused)
 
     def their_loss() -> Any:
         return flat_loss(forward(images, point, keep, state), lambda x: torch.log_softmax(x, -1), torch.exp)
@@ -187,13 +193,14 @@ def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
             return forward(images, point, keep, state)
 
     def their_gradient() -> None:
-        adam.zero_grad()
+        for leaf in leaves:
+            leaf.grad = None
         their_loss().backward()
 
-    def their_update() -> None:
+    def their_update(optimizer: Any) -> None:
         their_gradient()
         torch.nn.utils.clip_grad_norm_(leaves, config.learner.max_grad_norm or 1e9)
-        adam.step()
+        optimizer.step()
 
     for mine, other in zip(ours["forward"](params), their_forward(), strict=True):
         np.testing.assert_allclose(mine, other.numpy(), atol=2e-4)
@@ -207,7 +214,8 @@ def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
     calls: dict[str, tuple[Callable, Callable]] = {
         "forward": (lambda: jax.block_until_ready(ours["forward"](params)), their_forward),
         "forward_backward": (lambda: jax.block_until_ready(ours["forward_backward"](params)), their_gradient),
-        "update": (our_update, their_update),
+        "update": (our_update, functools.partial(their_update, adam(fused=False))),
+        "update_fused": (our_update, functools.partial(their_update, adam(fused=True))),
     }
     record: dict[str, Any] = {"experiment": name, "torso": options.torso, "num_envs": batch, "steps": STEPS - 1}
     for part, pair in calls.items():
@@ -257,7 +265,7 @@ def main(arguments: Sequence[str]) -> None:
     for name, config in configs.items():
         record = measure(name, config, options)
         records.append(record | device)
-        for part in ("forward", "forward_backward", "update"):
+        for part in PARTS:
             speeds = record[part]
             print(
                 f"  {name:20} {part:17} foajax {speeds['foajax']:8,.0f}  PyTorch {speeds['pytorch']:8,.0f} steps/s"
