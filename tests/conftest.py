@@ -1,4 +1,4 @@
-"""What every test runs under: the CPU, checked shapes and types, no rank promotion, kept compilations."""
+"""What every test runs under: the CPU unless JAX_PLATFORMS says otherwise, checked shapes and types, no rank promotion, kept compilations."""
 
 from __future__ import annotations
 
