@@ -1,4 +1,4 @@
-"""What every test runs under: the CPU unless JAX_PLATFORMS says otherwise, checked shapes and types, no rank promotion, kept compilations."""
+"""What every test runs under: the CPU or JAX_PLATFORMS, checked shapes and types, no rank promotion, a cache."""
 
 from __future__ import annotations
 
