@@ -12,7 +12,6 @@ foajax itself does not use. Run it on an idle machine.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import os
 import platform
 import statistics
@@ -20,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -138,89 +137,110 @@ def flat_loss(outputs: Sequence[Any], log_softmax: Callable, actions: Callable) 
     return total
 
 
-def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
-    """One experiment on both sides."""
-    import torch
+class Inputs(NamedTuple):
+    """What both sides are given."""
 
-    agent = Agent(config, ACTIONS, None)
-    params = agent.initial_params(jax.random.key(0))
-    random = np.random.default_rng(0)
-    batch = options.num_envs
-    shapes = image_shapes(config.sensor, config.env.frame_shape)
-    roi = [random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in shapes]
-    unit = random.uniform(-1, 1, (STEPS, batch, 2)).astype(np.float32)
-    is_first = random.random((STEPS, batch)) < 0.02
-    width = config.network.lstm
+    roi: list[np.ndarray]  # [T+1, B, h, w, 1] each
+    focal_point: np.ndarray  # [T+1, B, 2]
+    is_first: np.ndarray  # [T+1, B]
 
-    inputs = ([jnp.asarray(x) for x in roi], jnp.asarray(unit), jnp.asarray(is_first))
-    zeros = jnp.zeros((batch, width))
-    optimizer = make_optimizer(config.learner, 1)
+    @classmethod
+    def make(cls, config: Config, batch: int) -> Inputs:
+        """Noise."""
+        random = np.random.default_rng(0)
+        shapes = image_shapes(config.sensor, config.env.frame_shape)
+        return cls(
+            roi=[random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in shapes],
+            focal_point=random.uniform(-1, 1, (STEPS, batch, 2)).astype(np.float32),
+            is_first=random.random((STEPS, batch)) < 0.02,
+        )
 
-    def apply(params: Any) -> list:
-        output = agent.forward(params, *inputs, CoreState(cell=zeros, hidden=zeros))[0]
+
+def our_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable]:
+    """foajax's parts; `forward` returns the outputs, `forward_backward` the gradient."""
+    images, *others = jax.tree.map(jnp.asarray, inputs)
+    zeros = jnp.zeros((inputs.is_first.shape[1], agent.config.network.lstm))
+    optimizer = make_optimizer(agent.config.learner, 1)
+
+    def forward(params: Any) -> list:
+        output = agent.forward(params, images, *others, CoreState(cell=zeros, hidden=zeros))[0]
         return [x if x.ndim == 3 else x[..., None] for x in NetworkOutput(*output) if x is not None]
 
     def loss(params: Any) -> Any:
-        return flat_loss(apply(params), jax.nn.log_softmax, jnp.exp)
+        return flat_loss(forward(params), jax.nn.log_softmax, jnp.exp)
 
     def step(params: Any, state: Any) -> Any:
         change, state = optimizer.update(jax.grad(loss)(params), state, params)
         return jax.tree.map(jnp.add, params, change), state
 
-    ours = {"forward": jax.jit(apply), "forward_backward": jax.jit(jax.grad(loss))}
-    update = jax.jit(step, donate_argnums=(0, 1))
+    programs = {"forward": jax.jit(forward), "forward_backward": jax.jit(jax.grad(loss))}
+    compiled = jax.jit(step, donate_argnums=(0, 1))
     training = [jax.tree.map(jnp.copy, params), optimizer.init(params)]
 
-    def our_update() -> None:
-        training[:] = update(*training)
+    def update() -> None:
+        training[:] = compiled(*training)
         jax.block_until_ready(training)
 
-    forward, leaves = torch_network(params["params"], config.network)
-    images = [torch.tensor(x.reshape(-1, *x.shape[2:]).transpose(0, 3, 1, 2)).contiguous() for x in roi]
-    point = torch.tensor(unit.reshape(-1, 2)) if agent.network.sees_focal_point else None
-    keep = torch.tensor(1.0 - is_first[..., None].astype(np.float32))
-    state = (torch.zeros(batch, width), torch.zeros(batch, width))
+    calls: dict[str, Callable] = {
+        part: lambda program=program: jax.block_until_ready(program(params)) for part, program in programs.items()
+    }
+    return calls | {"update": update, "update_fused": update}
 
-    def adam(*, fused: bool) -> Any:
-        rate, eps = config.learner.learning_rate, config.learner.adam_eps
-        return torch.optim.Adam(leaves, lr=rate, eps=eps, amsgrad=True, fused=fused)
 
-    def their_loss() -> Any:
-        return flat_loss(forward(images, point, keep, state), lambda x: torch.log_softmax(x, -1), torch.exp)
+def their_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable]:
+    """The same parts in PyTorch."""
+    import torch
 
-    def their_forward() -> list:
+    config = agent.config
+    run, leaves = torch_network(params["params"], config.network)
+    images = [torch.tensor(x.reshape(-1, *x.shape[2:]).transpose(0, 3, 1, 2)).contiguous() for x in inputs.roi]
+    point = torch.tensor(inputs.focal_point.reshape(-1, 2)) if agent.network.sees_focal_point else None
+    keep = torch.tensor(1.0 - inputs.is_first[..., None].astype(np.float32))
+    zeros = torch.zeros(inputs.is_first.shape[1], config.network.lstm)
+    most = config.learner.max_grad_norm or 1e9
+
+    def forward() -> list:
         with torch.no_grad():
-            return forward(images, point, keep, state)
+            return run(images, point, keep, (zeros, zeros))
 
-    def their_gradient() -> None:
+    def gradient() -> list:
         for leaf in leaves:
             leaf.grad = None
-        their_loss().backward()
+        outputs = run(images, point, keep, (zeros, zeros))
+        flat_loss(outputs, lambda x: torch.log_softmax(x, -1), torch.exp).backward()
+        return [leaf.grad for leaf in leaves]
 
-    def their_update(optimizer: Any) -> None:
-        their_gradient()
-        torch.nn.utils.clip_grad_norm_(leaves, config.learner.max_grad_norm or 1e9)
-        optimizer.step()
+    def updating(*, fused: bool) -> Callable:
+        rate, eps = config.learner.learning_rate, config.learner.adam_eps
+        adam = torch.optim.Adam(leaves, lr=rate, eps=eps, amsgrad=True, fused=fused)
 
-    for mine, other in zip(ours["forward"](params), their_forward(), strict=True):
+        def update() -> None:
+            gradient()
+            torch.nn.utils.clip_grad_norm_(leaves, most)
+            adam.step()
+
+        return update
+
+    updates = {"update": updating(fused=False), "update_fused": updating(fused=True)}
+    return {"forward": forward, "forward_backward": gradient} | updates
+
+
+def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
+    """One experiment on both sides."""
+    agent = Agent(config, ACTIONS, None)
+    params = agent.initial_params(jax.random.key(0))
+    inputs = Inputs.make(config, options.num_envs)
+    sides = our_calls(agent, params, inputs), their_calls(agent, params, inputs)
+    for mine, other in zip(*(calls["forward"]() for calls in sides), strict=True):
         np.testing.assert_allclose(mine, other.numpy(), atol=2e-4)
-    gradient = jax.tree.leaves(ours["forward_backward"](params))
-    their_gradient()
-    norms = [
-        float(np.sqrt(sum((np.asarray(g) ** 2).sum() for g in side))) for side in (gradient, [x.grad for x in leaves])
-    ]
+    gradients = (jax.tree.leaves(calls["forward_backward"]()) for calls in sides)
+    norms = [float(np.sqrt(sum((np.asarray(g) ** 2).sum() for g in gradient))) for gradient in gradients]
     np.testing.assert_allclose(*norms, rtol=1e-3)
-
-    calls: dict[str, tuple[Callable, Callable]] = {
-        "forward": (lambda: jax.block_until_ready(ours["forward"](params)), their_forward),
-        "forward_backward": (lambda: jax.block_until_ready(ours["forward_backward"](params)), their_gradient),
-        "update": (our_update, functools.partial(their_update, adam(fused=False))),
-        "update_fused": (our_update, functools.partial(their_update, adam(fused=True))),
-    }
-    record: dict[str, Any] = {"experiment": name, "torso": options.torso, "num_envs": batch, "steps": STEPS - 1}
-    for part, pair in calls.items():
-        mine, other = _medians(pair, options.repeats)
-        steps = (STEPS - 1) * batch
+    record: dict[str, Any] = {"experiment": name, "torso": options.torso, "num_envs": options.num_envs}
+    record["steps"] = STEPS - 1
+    for part in PARTS:
+        mine, other = _medians([calls[part] for calls in sides], options.repeats)
+        steps = (STEPS - 1) * options.num_envs
         record[part] = {"foajax": steps / mine, "pytorch": steps / other, "ratio": other / mine}
     return record
 
