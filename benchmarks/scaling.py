@@ -78,7 +78,7 @@ class Assumptions:
     minibatches: int = 8
     gpu: float = 10e12  # operations a second that a GPU sustains on such small networks: assumed, not measured
     deciding: float = 0.95e-3  # of `act` on a GPU, whatever the batch: 1.0 ms at 32, 1.5 at 256 measured on an H200
-    updating: float = 3.2e-3  # of `update`, likewise: 3.4 ms for 80 steps, 3.2 for 640; its loops wait for each other
+    updating: float = 3.2e-3  # of `update`, likewise: 3.4 ms for 80 steps, 3.2 for 640
     bus: float = 20e9  # bytes a second from host to GPU: assumed, and in line with that H200
     link: float = 100e9  # bytes a second between the GPUs of a host: assumed
     network: float = 12.5e9  # bytes a second between hosts, 100 Gbit/s: assumed
