@@ -6,19 +6,21 @@ import ctypes
 import sys
 
 # Parameters of glibc's mallopt (malloc.h).
-_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
 
 
 def keep_memory() -> bool:
     """Makes the C library keep freed memory for the next allocation; returns whether it does.
 
     XLA on the CPU allocates a program's temporary arrays at each call. Above 32 MB glibc gives such memory back to
-    the system, and each call pays for its pages anew: up to half the time of an update. Only glibc has the switch.
+    the system, and each call pays for its pages anew: up to half the time of an update. Threads have arenas of their
+    own, which hold no block of 64 MB whatever is set, and so share one: call this before they are started. Only glibc
+    has these switches.
     """
     if not sys.platform.startswith("linux"):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return False
-    settings = {_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1, _M_TOP_PAD: 2**26}
+    settings = {_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: 2**31 - 1, _M_TOP_PAD: 2**26, _M_ARENA_MAX: 1}
     return all(mallopt(name, value) == 1 for name, value in settings.items())

@@ -6,29 +6,38 @@ import sys
 import pytest
 
 PROGRAM = """
-import resource, sys
+import resource, sys, threading
 from foajax.allocator import keep_memory
 if sys.argv[1] == "kept":
     assert keep_memory()
 
 def touch():
-    block = bytearray(64 * 2**20)  # zeroed: every page is touched
+    block = bytearray(80 * 2**20)  # zeroed: every page is touched
     block[::4096] = bytes(len(block) // 4096)
 
-touch()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(5):
+def faults():
     touch()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(5):
+        touch()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+
+if sys.argv[2] == "thread":
+    thread = threading.Thread(target=faults)
+    thread.start()
+    thread.join()
+else:
+    faults()
 """
 
 
-def page_faults(mode):
-    result = subprocess.run([sys.executable, "-c", PROGRAM, mode], capture_output=True, text=True, check=True)
-    return int(result.stdout)
+def page_faults(mode, where):
+    command = [sys.executable, "-c", PROGRAM, mode, where]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the setting is glibc's")
-def test_freed_memory_is_used_again_without_page_faults():
-    assert page_faults("given back") > 5 * 1000
-    assert page_faults("kept") < 500
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the settings are glibc's")
+@pytest.mark.parametrize("where", ["main", "thread"])
+def test_freed_memory_is_used_again_without_page_faults(where):
+    assert page_faults("given back", where) > 5 * 1000
+    assert page_faults("kept", where) < 500
