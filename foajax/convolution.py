@@ -9,12 +9,17 @@ images at a time. Both forms compute the same numbers; which one is used is sett
 from __future__ import annotations
 
 import functools
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from foajax.patches import PatchForm
+from foajax.winograd import WinogradForm, fewest_products
+
 _MANY_IMAGES = 8  # below, when a single agent acts, XLA's own form takes half the time on the CPU too
+_SLIM, _DEEP = 8, 64  # values in a patch's row: products of so few are slow, and of so many fast for a single row
 _CACHED_BYTES = 12 * 2**20  # of patches; measured: 6 to 20 MB are about equal, 40 MB costs twice the time
 
 
@@ -41,101 +46,96 @@ def convolve_plain(x: Array, kernel: Array, stride: int) -> Array:
 
 
 def _convolve_cpu(x: Array, kernel: Array, stride: int) -> Array:
-    if extra := -kernel.shape[1] % stride:
-        # Zeros make the kernel's width a whole number of strides.
-        x = jnp.pad(x, ((0, 0), (0, 0), (0, extra), (0, 0)))
-        kernel = jnp.pad(kernel, ((0, 0), (0, extra), (0, 0), (0, 0)))
-    return _patch_convolution(stride, x, kernel)
+    height, width, channels, features = kernel.shape
+    h, w = (x.shape[1] - height) // stride + 1, (x.shape[2] - width) // stride + 1
+    if stride == 1 and width * channels >= _DEEP:
+        rows = fewest_products(h, height)
+        if rows > 1:
+            return _in_parts(WinogradForm(rows), x, kernel)
+    # Neighbouring columns of the output may share a patch: as its features, with the kernel at each one's place in it.
+    # Zeros make that wide kernel a whole number of steps.
+    columns = _columns_together(w, width, stride) if width * channels <= _SLIM else 1
+    across = columns * stride
+    whole = _whole_steps(width, columns, stride)
+    x = jnp.pad(x, ((0, 0), (0, 0), (0, max(0, w * stride - across + whole - x.shape[2])), (0, 0)))
+    places = range(0, across, stride)
+    kernel = jnp.concatenate(
+        [jnp.pad(kernel, ((0, 0), (i, whole - width - i), (0, 0), (0, 0))) for i in places], axis=-1
+    )
+    return _in_parts(PatchForm(stride, across), x, kernel).reshape(-1, h, w, features)
 
 
-def _patches(x: Array, height: int, width: int, stride: int) -> Array:
-    """All patches as rows, [N*h*w, height*width*C]: first the columns of each are put together, then its rows."""
-    h, w = _number(x, height, width, stride)
-    blocks = _blocks(x, w, width, stride)
-    x = jnp.stack([blocks[:, :, j : j + w] for j in range(width // stride)], axis=3)
-    x = x.reshape(*x.shape[:3], -1)
-    slices = [x[:, i : i + stride * (h - 1) + 1 : stride] for i in range(height)]
-    return jnp.stack(slices, axis=3).reshape(x.shape[0] * h * w, -1)
+def _columns_together(w: int, width: int, stride: int) -> int:
+    """With how many columns of the output to a patch the patches hold the fewest values."""
+    divisors = [n for n in range(1, 9) if w % n == 0]
+    return min(divisors, key=lambda columns: _whole_steps(width, columns, stride) / columns)
 
 
-def _patches_at_once(x: Array, height: int, width: int, stride: int) -> Array:
-    """The same in one step: slower, but for most layers its transpose takes a half to a third of the time."""
-    h, w = _number(x, height, width, stride)
-    blocks = _blocks(x, w, width, stride)
-    down, across = range(height), range(width // stride)
-    slices = [blocks[:, i : i + stride * (h - 1) + 1 : stride, j : j + w] for i in down for j in across]
-    return jnp.stack(slices, axis=3).reshape(x.shape[0] * h * w, -1)
+def _whole_steps(width: int, columns: int, stride: int) -> int:
+    """Width of a patch that `columns` columns of the output share, in whole steps from one such patch to the next."""
+    step = columns * stride
+    return -(-(width + step - stride) // step) * step
 
 
-def _number(x: Array, height: int, width: int, stride: int) -> tuple[int, int]:
-    """Patches of an image, down and across."""
-    return (x.shape[1] - height) // stride + 1, (x.shape[2] - width) // stride + 1
+@runtime_checkable
+class Form(Protocol):
+    """A way to compute a convolution by matrix products, its gradients included."""
 
+    def patch_values(self, x: Array, kernel: Array) -> int:
+        """Values in the patches of one image."""
 
-def _blocks(x: Array, across: int, width: int, stride: int) -> Array:
-    """Rows in blocks of `stride` pixels, [N, H, blocks, stride*C]: fewer and longer slices to copy."""
-    n, rows, _, channels = x.shape
-    blocks = across - 1 + width // stride
-    return x[:, :, : blocks * stride].reshape(n, rows, blocks, stride * channels)
+    def forward(self, x: Array, kernel: Array) -> tuple[Array, Any]:
+        """The convolution, [N, h, w, D], and what the gradients need again."""
+
+    def backward(self, x: Array, kernel: Array, saved: Any, dy: Array) -> tuple[Array, Array]:
+        """Gradients of image and kernel."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _patch_convolution(stride: int, x: Array, kernel: Array) -> Array:
-    return _patch_forward(stride, x, kernel)[0]
+def _in_parts(form: Form, x: Array, kernel: Array) -> Array:
+    return _forward(form, x, kernel)[0]
 
 
-def _patch_forward(stride: int, x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array, Array | None]]:
-    height, width, _, features = kernel.shape
-    h, w = _number(x, height, width, stride)
-    flat = kernel.reshape(-1, features)
-    part = _images_at_once(x, h * w * flat.shape[0])
-    patches = None
+def _forward(form: Form, x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array, Any]]:
+    part = _images_at_once(form, x, kernel)
     if part == x.shape[0]:
-        patches = _patches(x, height, width, stride)
-        y = patches @ flat
-    else:
-        y = jax.lax.map(lambda images: _patches(images, height, width, stride) @ flat, _split(x, part))
-    return y.reshape(x.shape[0], h, w, features), (x, kernel, patches)
+        y, saved = form.forward(x, kernel)
+        return y, (x, kernel, saved)
+    y = jax.lax.map(lambda images: form.forward(images, kernel)[0], _split(x, part))
+    return y.reshape(-1, *y.shape[2:]), (x, kernel, None)
 
 
-def _patch_backward(stride: int, residuals: tuple[Array, Array, Array | None], dy: Array) -> tuple[Array, Array]:
-    x, kernel, patches = residuals
-    height, width, _, features = kernel.shape
-    flat = kernel.reshape(-1, features)
-
-    def gradients(images: Array, dy: Array, patches: Array) -> tuple[Array, Array]:
-        dy = dy.reshape(-1, features)
-        # The transposed product is the faster one of the two: the long axis is contracted with the few features first.
-        dkernel = dy.T @ patches
-        (dx,) = jax.linear_transpose(lambda x: _patches_at_once(x, height, width, stride), images)(dy @ flat.T)
-        return dkernel, dx
-
-    if patches is not None:
-        dkernel, dx = gradients(x, dy, patches)
-        return dx, dkernel.T.reshape(kernel.shape)
+def _backward(form: Form, residuals: tuple[Array, Array, Any], dy: Array) -> tuple[Array, Array]:
+    x, kernel, saved = residuals
+    if saved is not None:
+        return form.backward(x, kernel, saved, dy)
 
     def add(total: Array, part: tuple[Array, Array]) -> tuple[Array, Array]:
         images, dy = part
-        # Made again: that is faster than to fetch them from memory.
-        dkernel, dx = gradients(images, dy, _patches(images, height, width, stride))
+        # Patches are made again: that is faster than to fetch them from memory.
+        _, saved = form.forward(images, kernel)
+        dx, dkernel = form.backward(images, kernel, saved, dy)
         return total + dkernel, dx
 
-    part = _images_at_once(x, dy.shape[1] * dy.shape[2] * flat.shape[0])
-    dkernel, dx = jax.lax.scan(add, jnp.zeros_like(flat.T), (_split(x, part), _split(dy, part)))
-    return dx.reshape(x.shape), dkernel.T.reshape(kernel.shape)
+    part = _images_at_once(form, x, kernel)
+    dkernel, dx = jax.lax.scan(add, jnp.zeros_like(kernel), (_split(x, part), _split(dy, part)))
+    return dx.reshape(x.shape), dkernel
 
 
-def _images_at_once(x: Array, patch_values: int) -> int:
-    """How many images' patches are made at a time, a divisor of their number: so many as stay in the caches."""
-    most = max(1, _CACHED_BYTES // (patch_values * x.dtype.itemsize))
+_in_parts.defvjp(_forward, _backward)
+
+
+def _images_at_once(form: Form, x: Array, kernel: Array) -> int:
+    """How many images' patches are made at a time, a divisor of their number."""
+    size = form.patch_values(x, kernel) * x.dtype.itemsize
+    if x.shape[0] * size <= 2 * _CACHED_BYTES:
+        return x.shape[0]
+    most = max(1, _CACHED_BYTES // size)
     return max(n for n in range(1, min(most, x.shape[0]) + 1) if x.shape[0] % n == 0)
 
 
 def _split(x: Array, part: int) -> Array:
     return x.reshape(x.shape[0] // part, part, *x.shape[1:])
-
-
-_patch_convolution.defvjp(_patch_forward, _patch_backward)
 
 
 def max_pool(x: Float[Array, "N H W C"]) -> Float[Array, "N h w C"]:

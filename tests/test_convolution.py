@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import convolution
+from foajax import convolution, winograd
 from foajax.convolution import convolve, convolve_plain, max_pool
 
 # (image, kernel, stride): the layers of both torsos at small sizes, then odd and rectangular ones.
@@ -21,6 +21,17 @@ CASES = [
     ((2, 10, 11, 2), (4, 2, 2, 3), 2),
     ((1, 4, 4, 3), (4, 4, 3, 2), 1),
     ((12, 6, 6, 2), (3, 3, 2, 4), 1),
+    # Deep enough for fewer products: tiles of 5, 4, 4, 3 and 2 rows, with and without rows left over.
+    ((2, 7, 7, 24), (3, 3, 24, 5), 1),
+    ((2, 9, 8, 22), (3, 3, 22, 4), 1),
+    ((2, 12, 9, 16), (4, 4, 16, 3), 1),
+    ((3, 14, 9, 13), (5, 5, 13, 4), 1),
+    ((3, 3, 6, 32), (2, 2, 32, 3), 1),
+    # Slim: four, five and two columns share a patch; 13 columns do not.
+    ((2, 10, 12, 1), (5, 5, 1, 3), 1),
+    ((2, 9, 9, 1), (5, 5, 1, 3), 1),
+    ((2, 16, 12, 1), (6, 6, 1, 3), 2),
+    ((2, 9, 17, 1), (5, 5, 1, 3), 1),
 ]
 
 
@@ -51,14 +62,18 @@ def cache(request, monkeypatch):
     monkeypatch.setattr(convolution, "_CACHED_BYTES", request.param)
 
 
+@pytest.mark.parametrize("image, kernel, stride", CASES)
+def test_plain_form_follows_the_definition(image, kernel, stride):
+    x, w = arrays(image, kernel)
+    np.testing.assert_allclose(convolve_plain(x, w, stride), loop(x, w, stride), atol=2e-5)
+
+
 @pytest.mark.usefixtures("cache")
 @pytest.mark.parametrize("image, kernel, stride", CASES)
-@pytest.mark.parametrize("form", [convolution._convolve_cpu, convolve_plain])
-def test_form_follows_the_definition(form, image, kernel, stride):
+def test_fast_form_follows_the_definition(image, kernel, stride):
     x, w = arrays(image, kernel)
-    expected = loop(x, w, stride)
-    np.testing.assert_allclose(form(x, w, stride), expected, atol=2e-5)
-    np.testing.assert_allclose(jax.jit(lambda x, w: form(x, w, stride))(x, w), expected, atol=2e-5)
+    fast = jax.jit(lambda x, w: convolution._convolve_cpu(x, w, stride))
+    np.testing.assert_allclose(fast(x, w), loop(x, w, stride), atol=2e-5)
 
 
 @pytest.mark.usefixtures("cache")
@@ -68,10 +83,39 @@ def test_both_gradients_of_the_fast_form_are_the_plain_ones(image, kernel, strid
     weights = jnp.asarray(np.random.default_rng(7).normal(size=loop(x, w, stride).shape), jnp.float32)
 
     def gradients(form):
-        return jax.grad(lambda x, w: jnp.sum(form(x, w, stride) * weights), argnums=(0, 1))(x, w)
+        return jax.jit(jax.grad(lambda x, w: jnp.sum(form(x, w, stride) * weights), argnums=(0, 1)))(x, w)
 
     for fast, plain in zip(gradients(convolution._convolve_cpu), gradients(convolve_plain), strict=True):
         np.testing.assert_allclose(fast, plain, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("taps", [2, 3, 4, 5])
+@pytest.mark.parametrize("rows", [2, 3, 4, 5])
+def test_transforms_filter_exactly(rows, taps):
+    if rows + taps > 8:
+        pytest.skip("more points than are used")
+    of_image, of_kernel, of_output = winograd._transforms(rows, taps)
+    rng = np.random.default_rng(rows + taps)
+    x, kernel = rng.normal(size=rows + taps - 1), rng.normal(size=taps)
+    np.testing.assert_allclose(
+        of_output @ ((of_kernel @ kernel) * (of_image @ x)), np.correlate(x, kernel, mode="valid"), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "h, taps, rows", [(5, 3, 5), (7, 3, 4), (18, 4, 4), (38, 5, 3), (2, 2, 2), (1, 3, 1), (20, 6, 2), (20, 7, 1)]
+)
+def test_tiles_take_the_fewest_products_or_are_not_used(h, taps, rows):
+    assert winograd.fewest_products(h, taps) == rows
+
+
+@pytest.mark.parametrize(
+    "shape, kernel, products",
+    [((8, 7, 7, 64), (3, 3, 64, 64), 7), ((8, 42, 42, 32), (5, 5, 32, 32), 7), ((8, 84, 84, 1), (5, 5, 1, 32), 1)],
+)
+def test_layers_of_the_torsos_take_as_many_products_as_they_should(shape, kernel, products):
+    x, w = arrays(shape, kernel)
+    assert str(jax.make_jaxpr(convolve)(x, w)).count("dot_general") == products + (products > 1)  # one for the kernels
 
 
 def test_backend_and_batch_choose_the_form(monkeypatch):
