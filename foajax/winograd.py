@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from foajax.patches import Window, add_patches, kernel_gradient, patches
+from foajax.patches import Window, add_patches, patches
 
 # Where the polynomials are evaluated, beside infinity. With more than these, float32 loses digits.
 _POINTS = (0.0, 1.0, -1.0, 2.0, -2.0, 0.5)
@@ -37,30 +37,33 @@ class WinogradForm:
         h, w = Window(height, width).number(x)
         return _products(h, self.rows, height) * w * width * channels
 
-    def forward(self, x: Array, kernel: Array) -> tuple[Array, list[Array]]:
-        """The convolution, [N, h, w, D], and what the gradient needs again."""
+    def forward(self, x: Array, kernel: Array) -> tuple[Array, Array]:
+        """The convolution, [N, h, w, D], and what the gradients need again."""
         height, width, _, features = kernel.shape
         h, w = Window(height, width).number(x)
+        kernels = self._kernels(kernel)
+        inputs = _barrier(self._inputs(x, height))
+        patched = patches(inputs.reshape(-1, 1, *inputs.shape[3:]), Window(1, width))
+        patched = patched.reshape(len(kernels), -1, kernels.shape[1])
+        products = _barrier(jnp.einsum("prk,pkd->prd", patched, kernels))
         _, _, of_output = _transforms(self.rows, height)
-        rows = [patches(v, Window(1, width)) for v in _barrier(self._inputs(x, height))]
-        products = _barrier([v @ k for v, k in zip(rows, self._kernels(kernel), strict=True)])
-        y = _combine(of_output, [v.reshape(x.shape[0], -1, w, features) for v in products])
-        return jnp.stack(y, axis=2).reshape(x.shape[0], -1, w, features)[:, :h], rows
+        y = _combine(of_output, products.reshape(len(kernels), x.shape[0], -1, w, features), axis=2)
+        return y.reshape(x.shape[0], -1, w, features)[:, :h], patched
 
-    def backward(self, x: Array, kernel: Array, rows: list[Array], dy: Array) -> tuple[Array, Array]:
+    def backward(self, x: Array, kernel: Array, patched: Array, dy: Array) -> tuple[Array, Array]:
         """Gradients of image and kernel."""
         height, width, channels, features = kernel.shape
         _, of_kernel, of_output = _transforms(self.rows, height)
         dy = jnp.pad(dy, ((0, 0), (0, -dy.shape[1] % self.rows), (0, 0), (0, 0)))
         dy = dy.reshape(x.shape[0], -1, self.rows, *dy.shape[2:])
-        products = _barrier(_combine(of_output.T, [dy[:, :, i] for i in range(self.rows)]))
-        products = [v.reshape(-1, features) for v in products]
-        dkernels = jnp.stack([kernel_gradient(v, row) for v, row in zip(products, rows, strict=True)])
+        products = _barrier(_combine(of_output.T, jnp.moveaxis(dy, 2, 0)))
+        products = products.reshape(len(patched), -1, features)
+        dkernels = _barrier(jnp.einsum("prd,prk->pdk", products, patched)).swapaxes(1, 2)
         dkernel = jnp.tensordot(jnp.asarray(of_kernel.T, x.dtype), dkernels, 1).reshape(kernel.shape)
-        like = jnp.zeros((rows[0].shape[0] // dy.shape[3], 1, x.shape[2], channels), x.dtype)
-        pairs = zip(products, self._kernels(kernel), strict=True)
-        inputs = _barrier([add_patches(v @ k.T, like, Window(1, width)) for v, k in pairs])
-        return self._add_inputs(inputs, x, height), dkernel
+        dpatched = jnp.einsum("prd,pkd->prk", products, self._kernels(kernel)).reshape(-1, width * channels)
+        like = jnp.zeros((len(dpatched) // dy.shape[3], 1, *x.shape[2:]), x.dtype)
+        dinputs = _barrier(add_patches(dpatched, like, Window(1, width)))
+        return self._add_inputs(dinputs.reshape(len(patched), x.shape[0], -1, *x.shape[2:]), x, height), dkernel
 
     def _kernels(self, kernel: Array) -> Array:
         """G k: a kernel of one row for each product, [products, width*C, D]."""
@@ -68,27 +71,28 @@ class WinogradForm:
         of_kernel = jnp.asarray(_transforms(self.rows, height)[1], kernel.dtype)
         return (of_kernel @ kernel.reshape(height, -1)).reshape(-1, width * channels, features)
 
-    def _inputs(self, x: Array, taps: int) -> list[Array]:
-        """B^T x: for each product an image of one row for each tile, [N*tiles, 1, W, C]."""
+    def _inputs(self, x: Array, taps: int) -> Array:
+        """B^T x: for each product a row of each tile, [products, N, tiles, W, C]."""
         tiles = -(-(x.shape[1] - taps + 1) // self.rows)
         of_image = _transforms(self.rows, taps)[0]
         x = jnp.pad(x, ((0, 0), (0, tiles * self.rows + taps - 1 - x.shape[1]), (0, 0), (0, 0)))
         last = self.rows * (tiles - 1) + 1
-        combined = _combine(of_image, [x[:, i : i + last : self.rows] for i in range(len(of_image))])
-        return [v.reshape(-1, 1, *x.shape[2:]) for v in combined]
+        return _combine(of_image, [x[:, i : i + last : self.rows] for i in range(len(of_image))])
 
-    def _add_inputs(self, inputs: list[Array], x: Array, taps: int) -> Array:
+    def _add_inputs(self, dinputs: Array, x: Array, taps: int) -> Array:
         """The transpose of `_inputs`. Written out: XLA's own pads each row by itself, and adds whole images."""
-        of_image = _transforms(self.rows, taps)[0]
-        tiles = _combine(of_image.T, [v.reshape(x.shape[0], -1, *x.shape[2:]) for v in inputs])
-        beyond = (taps - 1 + self.rows - 1) // self.rows  # how many tiles on a tile's last rows reach
-        added = []
-        for i in range(self.rows):
-            shifted = [
-                jnp.pad(v, ((0, 0), (k, beyond - k), (0, 0), (0, 0))) for k, v in enumerate(tiles[i :: self.rows])
-            ]
-            added.append(functools.reduce(jnp.add, shifted))
-        return jnp.stack(added, axis=2).reshape(x.shape[0], -1, *x.shape[2:])[:, : x.shape[1]]
+        rows = _combine(_transforms(self.rows, taps)[0].T, dinputs)
+        beyond = -(-(taps - 1) // self.rows)  # how many tiles on a tile's last rows reach
+
+        def row(i: int) -> Array:
+            """Row i of each tile: its own, and what the tiles before have of it."""
+            shares = enumerate(rows[i :: self.rows])
+            return functools.reduce(
+                jnp.add, [jnp.pad(share, ((0, 0), (k, beyond - k), (0, 0), (0, 0))) for k, share in shares]
+            )
+
+        image = jnp.stack([row(i) for i in range(self.rows)], axis=2)
+        return image.reshape(x.shape[0], -1, *x.shape[2:])[:, : x.shape[1]]
 
 
 def fewest_products(h: int, taps: int) -> int:
@@ -123,7 +127,7 @@ def _transforms(rows: int, taps: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return np.array(basis), evaluate(taps) / np.array(denominators)[:, None], evaluate(rows).T
 
 
-def _combine(matrix: np.ndarray, rows: Sequence[Array]) -> list[Array]:
-    """matrix @ rows, elementwise: most of its entries are 0, 1 or -1."""
+def _combine(matrix: np.ndarray, rows: Sequence[Array] | Array, *, axis: int = 0) -> Array:
+    """matrix @ rows, elementwise: most of its entries are 0, 1 or -1. The results are stacked along `axis`."""
     terms = [[float(c) * row for c, row in zip(weights, rows, strict=True) if c] for weights in matrix]
-    return [functools.reduce(jnp.add, row) for row in terms]
+    return jnp.stack([functools.reduce(jnp.add, row) for row in terms], axis=axis)
