@@ -3,7 +3,8 @@
 XLA's convolution is right for accelerators. On the CPU its gradients run at a fraction of the speed of a
 matrix product, so there a convolution is written as patches times kernel: both gradients are matrix
 products too. Where the patches of all images together are too large for the caches, a loop takes some
-images at a time. Both forms compute the same numbers; which one is used is settled when a program is traced.
+images at a time. All forms compute the same numbers, but for rounding; which one is used is settled when a program
+is traced.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from foajax.winograd import WinogradForm, fewest_products
 
 _MANY_IMAGES = 8  # below, when a single agent acts, XLA's own form takes half the time on the CPU too
 _SLIM, _DEEP = 8, 64  # values in a patch's row: products of so few are slow, and of so many fast for a single row
-_CACHED_BYTES = 12 * 2**20  # of patches; measured: 6 to 20 MB are about equal, 40 MB costs twice the time
+_CACHED_BYTES = 12 * 2**20  # of patches; measured: 6 to 24 MB are about equal, 67 MB cost a tenth more
 
 
 def convolve(
@@ -126,7 +127,7 @@ _in_parts.defvjp(_forward, _backward)
 
 
 def _images_at_once(form: Form, x: Array, kernel: Array) -> int:
-    """How many images' patches are made at a time, a divisor of their number."""
+    """How many images' patches are made at a time, a divisor of their number; a loop of two pays for itself no more."""
     size = form.patch_values(x, kernel) * x.dtype.itemsize
     if x.shape[0] * size <= 2 * _CACHED_BYTES:
         return x.shape[0]

@@ -22,6 +22,7 @@ from foajax.patches import Window, add_patches, patches
 
 # Where the polynomials are evaluated, beside infinity. With more than these, float32 loses digits.
 _POINTS = (0.0, 1.0, -1.0, 2.0, -2.0, 0.5)
+_WORTHWHILE = 0.8  # of the products: the combinations cost something too
 _barrier = jax.lax.optimization_barrier  # or XLA computes a combination again for each patch that it is copied to
 
 
@@ -99,9 +100,6 @@ def fewest_products(h: int, taps: int) -> int:
     """The rows of a tile with which `h` rows of an output take the fewest products; 1 where that saves too little."""
     rows = min(range(2, len(_POINTS) + 3 - taps), key=lambda rows: _products(h, rows, taps), default=1)
     return rows if _products(h, rows, taps) <= _WORTHWHILE * h * taps else 1
-
-
-_WORTHWHILE = 0.8  # of the products; the combinations cost something too
 
 
 def _products(h: int, rows: int, taps: int) -> int:
