@@ -1,10 +1,10 @@
 """Convolution and max-pooling in the form that suits the backend.
 
 XLA's convolution is right for accelerators. On the CPU its gradients run at a fraction of the speed of a
-matrix product, so there a convolution is written as patches times kernel: both gradients are matrix
-products too. Where the patches of all images together are too large for the caches, a loop takes some
-images at a time. All forms compute the same numbers, but for rounding; which one is used is settled when a program
-is traced.
+matrix product, so there a convolution is written as patches times kernel (`patches.py`): both gradients are matrix
+products too, of which a stride of 1 needs fewer (`winograd.py`). Where the patches of all images together are too
+large for the caches, a loop takes some images at a time. All forms compute the same numbers, but for rounding; which
+one is used is settled when a program is traced.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foajax.patches import PatchForm
+from foajax.patches import PatchForm, Window
 from foajax.winograd import WinogradForm, fewest_products
 
 _MANY_IMAGES = 8  # below, when a single agent acts, XLA's own form takes half the time on the CPU too
@@ -48,7 +48,7 @@ def convolve_plain(x: Array, kernel: Array, stride: int) -> Array:
 
 def _convolve_cpu(x: Array, kernel: Array, stride: int) -> Array:
     height, width, channels, features = kernel.shape
-    h, w = (x.shape[1] - height) // stride + 1, (x.shape[2] - width) // stride + 1
+    h, w = Window(height, width, stride, stride).number(x)
     if stride == 1 and width * channels >= _DEEP:
         rows = fewest_products(h, height)
         if rows > 1:
@@ -127,7 +127,10 @@ _in_parts.defvjp(_forward, _backward)
 
 
 def _images_at_once(form: Form, x: Array, kernel: Array) -> int:
-    """How many images' patches are made at a time, a divisor of their number; a loop of two pays for itself no more."""
+    """How many images' patches are made at a time, a divisor of their number.
+
+    All of them up to twice what stays in the caches: the loop costs something too.
+    """
     size = form.patch_values(x, kernel) * x.dtype.itemsize
     if x.shape[0] * size <= 2 * _CACHED_BYTES:
         return x.shape[0]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 
 class Window(NamedTuple):
-    """The size of a patch and its step; `width` is a multiple of `across`."""
+    """The size of a patch and its steps."""
 
     height: int
     width: int
@@ -25,7 +25,10 @@ class Window(NamedTuple):
 
 
 def patches(x: Float[Array, "N H W C"], window: Window) -> Float[Array, "R P"]:
-    """All patches as rows, [N*h*w, height*width*C]: first the columns of each are put together, then its rows."""
+    """All patches as rows, [N*h*w, height*width*C]: first the columns of each are put together, then its rows.
+
+    The window's width is a multiple of its step across.
+    """
     h, w = window.number(x)
     blocks = _blocks(x, window)
     x = jnp.stack([blocks[:, :, j : j + w] for j in range(window.width // window.across)], axis=3)
@@ -40,12 +43,12 @@ def add_patches(rows: Float[Array, "R P"], x: Float[Array, "N H W C"], window: W
     return image
 
 
-def kernel_gradient(dy: Float[Array, "R D"], rows: Float[Array, "R P"]) -> Float[Array, "P D"]:
+def kernel_gradient(dy: Float[Array, "*B R D"], rows: Float[Array, "*B R P"]) -> Float[Array, "*B P D"]:
     """rows^T dy as (dy^T rows)^T, two thirds of the time: the long axis is contracted with the few features first.
 
     XLA would make the one form of the other again.
     """
-    return jax.lax.optimization_barrier(dy.T @ rows).T
+    return jax.lax.optimization_barrier(dy.mT @ rows).mT
 
 
 def _patches_at_once(x: Array, window: Window) -> Array:

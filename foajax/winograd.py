@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from foajax.patches import Window, add_patches, patches
+from foajax.patches import Window, add_patches, kernel_gradient, patches
 
 # Where the polynomials are evaluated, beside infinity. With more than these, float32 loses digits.
 _POINTS = (0.0, 1.0, -1.0, 2.0, -2.0, 0.5)
@@ -46,7 +46,7 @@ class WinogradForm:
         inputs = _barrier(self._inputs(x, height))
         patched = patches(inputs.reshape(-1, 1, *inputs.shape[3:]), Window(1, width))
         patched = patched.reshape(len(kernels), -1, kernels.shape[1])
-        products = _barrier(jnp.einsum("prk,pkd->prd", patched, kernels))
+        products = _barrier(patched @ kernels)
         _, _, of_output = _transforms(self.rows, height)
         y = _combine(of_output, products.reshape(len(kernels), x.shape[0], -1, w, features), axis=2)
         return y.reshape(x.shape[0], -1, w, features)[:, :h], patched
@@ -59,9 +59,9 @@ class WinogradForm:
         dy = dy.reshape(x.shape[0], -1, self.rows, *dy.shape[2:])
         products = _barrier(_combine(of_output.T, jnp.moveaxis(dy, 2, 0)))
         products = products.reshape(len(patched), -1, features)
-        dkernels = _barrier(jnp.einsum("prd,prk->pdk", products, patched)).swapaxes(1, 2)
+        dkernels = kernel_gradient(products, patched)
         dkernel = jnp.tensordot(jnp.asarray(of_kernel.T, x.dtype), dkernels, 1).reshape(kernel.shape)
-        dpatched = jnp.einsum("prd,pkd->prk", products, self._kernels(kernel)).reshape(-1, width * channels)
+        dpatched = (products @ self._kernels(kernel).mT).reshape(-1, width * channels)
         like = jnp.zeros((len(dpatched) // dy.shape[3], 1, *x.shape[2:]), x.dtype)
         dinputs = _barrier(add_patches(dpatched, like, Window(1, width)))
         return self._add_inputs(dinputs.reshape(len(patched), x.shape[0], -1, *x.shape[2:]), x, height), dkernel
