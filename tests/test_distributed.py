@@ -10,6 +10,7 @@ import socket
 import time
 from pathlib import Path
 
+import chex
 import jax
 import numpy as np
 import processes
@@ -72,7 +73,7 @@ def assert_same(run, other):
     a, b = load_agent(run), load_agent(other)
     assert a.env_steps == b.env_steps
     learned = [(stored.params, stored.statistics) for stored in (a, b)]
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=2e-4, atol=2e-6), *learned)
+    chex.assert_trees_all_close(*learned, rtol=2e-4, atol=2e-6)
     # Scores and games are counted over all processes, in the same order.
     for row, expected in zip(rows(run), rows(other), strict=True):
         for name in ("env_steps", "games", "score", "length"):

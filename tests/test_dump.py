@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,7 +60,7 @@ def test_the_file_has_what_the_update_had(seek, tmp_path, told):
     assert facts == {"env_steps": "4800", "epoch": "0", "group": "0", "minibatch": "1"}
     arrays = load_file(path)
     assert np.isnan(arrays["rollout/steps/reward"][3, 5])
-    jax.tree.map(np.testing.assert_array_equal, arrays, named(dict(zip(("params", "rollout"), expected, strict=True))))
+    chex.assert_trees_all_equal(arrays, named(dict(zip(("params", "rollout"), expected, strict=True))))
     loss, _ = seek.loss(jax.tree.map(jnp.asarray, expected[0]), jax.tree.map(jnp.asarray, expected[1]))
     assert np.isnan(loss)
 

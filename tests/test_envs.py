@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import chex
 import cv2
 import gymnasium
 import jax
@@ -337,11 +338,11 @@ def test_a_saved_state_goes_on_bit_for_bit():
         first.send(action)
         before = first.recv()
     restored = second.set_state(first.get_state())
-    jax.tree.map(np.testing.assert_array_equal, restored, before)
+    chex.assert_trees_all_equal(restored, before)
     for action in actions[90:]:
         first.send(action)
         second.send(action)
-        jax.tree.map(np.testing.assert_array_equal, first.recv(), second.recv())
+        chex.assert_trees_all_equal(first.recv(), second.recv())
 
 
 def test_environments_differ_and_a_seed_repeats():

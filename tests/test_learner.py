@@ -1,5 +1,6 @@
 """The update: what it learns where values are known, what it must leave alone, and one compilation."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -153,7 +154,7 @@ def test_what_is_not_finite_is_skipped_and_counted(seek, where):
     else:
         state = state._replace(params=jax.tree.map(lambda x: x.at[(0,) * x.ndim].set(jnp.inf), state.params))
     after, metrics = update(state, rollout)
-    jax.tree.map(np.testing.assert_array_equal, (after.params, after.opt_state), (state.params, state.opt_state))
+    chex.assert_trees_all_equal((after.params, after.opt_state), (state.params, state.opt_state))
     assert metrics["skipped"] == 1 and after.skipped == state.skipped + 1
     assert metrics["skipped_updates"] == 1
     again, metrics = update(after, rollout)
@@ -173,7 +174,7 @@ def test_a_parameter_that_overflows_is_caught_in_the_update_that_would_make_it(s
     after, metrics = seek.programs.update(state, rollout, np.int32(0), np.bool_(True))
     assert np.isfinite(metrics["loss"]) and np.isfinite(metrics["grad_norm"])
     assert metrics["skipped"] == 1 and not np.isfinite(metrics["param_norm"])
-    jax.tree.map(np.testing.assert_array_equal, after.params, before.params)
+    chex.assert_trees_all_equal(after.params, before.params)
     assert after.opt_state.count == before.opt_state.count and metrics["skipped_updates"] == 1
 
 
@@ -232,7 +233,7 @@ def test_two_groups_see_what_each_would_alone():
     alone = Collector(loop.agent, loop.programs, make_environments(loop.config, 0)[:1], seed=0)
     (expected,), _ = alone.collect(loop.state, 0)
     (first, second), _ = loop.collect()
-    jax.tree.map(np.testing.assert_array_equal, expected.steps, first.steps)
+    chex.assert_trees_all_equal(expected.steps, first.steps)
     assert first.steps.reward.shape == second.steps.reward.shape == (7, 4)
     loop.run(2)
     assert loop.programs.update._cache_size() == 1

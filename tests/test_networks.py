@@ -1,5 +1,6 @@
 """Shapes of both torsos for every sensor, one state for whole and split unrolls, the heads' presence."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,8 +93,8 @@ def test_a_split_unroll_is_the_whole():
     first, middle = network.apply(params, [x[:3] for x in roi], focal_point[:3], is_first[:3], state)
     second, end = network.apply(params, [x[3:] for x in roi], focal_point[3:], is_first[3:], middle)
     joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), joined, whole)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), end, last)
+    chex.assert_trees_all_close(joined, whole, atol=1e-5)
+    chex.assert_trees_all_close(end, last, atol=1e-5)
 
 
 def test_environments_do_not_mix_and_episodes_do_not_leak():

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -212,5 +213,5 @@ def test_a_gradient_that_is_not_accepted_changes_nothing(max_grad_norm, value):
     for state in (optimizer.init(params), optimizer.update(params, optimizer.init(params))[1]):
         bad = jax.tree.map(lambda p: jnp.full_like(p, value), params)
         change, after = jax.jit(optimizer.update)(bad, state, accept=jnp.bool_(False))
-        jax.tree.map(np.testing.assert_array_equal, after, state)
+        chex.assert_trees_all_equal(after, state)
         assert all((c == 0).all() for c in jax.tree.leaves(change))

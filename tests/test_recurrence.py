@@ -1,5 +1,6 @@
 """The LSTM against a step-by-step NumPy one; its written-out gradient against automatic differentiation."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,7 +73,7 @@ def assert_same_gradient(projected, kernel, is_first, state):
 
         return jax.grad(scalar, argnums=(0, 1, 2))(projected, kernel, state)
 
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), total(lstm), total(autodiff_lstm))
+    chex.assert_trees_all_close(total(lstm), total(autodiff_lstm), rtol=1e-4, atol=1e-5)
 
 
 def test_two_halves_are_the_whole(inputs):

@@ -6,6 +6,7 @@ import shutil
 import signal
 import time
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from foajax.train import Run, train
 
 
 def same(one, other):
-    jax.tree.map(np.testing.assert_array_equal, (one.params, one.statistics), (other.params, other.statistics))
+    chex.assert_trees_all_equal((one.params, one.statistics), (other.params, other.statistics))
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,7 @@ def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(brea
         state, tracker, env_steps = run._state, run._tracker.get_state(), run._env_steps
     template = jax.eval_shape(lambda: state)
     saved = Checkpoints(path / "checkpoints", keep=None).restore({"train": template, "collector": []})
-    jax.tree.map(np.testing.assert_array_equal, state, saved.state["train"])  # optimiser and counters too
+    chex.assert_trees_all_equal(state, saved.state["train"])  # optimiser and counters too
     assert state.updates == env_steps / 40 * 2 * 2 and state.opt_state.count == state.updates
     assert env_steps == saved.env_steps == rows(path)[-1]["env_steps"] >= 1000
     assert tracker == saved.meta["tracker"] | {name: [0] * 8 for name in ("scores", "lengths")}
@@ -113,7 +114,7 @@ def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path):
     code, out, err = finish(*words, "train.env_steps=40", "learner.learning_rate=1e-30")
     assert code == 0, err
     assert f"new run of constant50_sub2_packed on breakout, from the parameters of {run}" in out
-    jax.tree.map(np.testing.assert_array_equal, load_agent(tmp_path).params, load_agent(run).params)
+    chex.assert_trees_all_equal(load_agent(tmp_path).params, load_agent(run).params)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-import jax
-import numpy as np
+import chex
 import pytest
 from processes import TINY, finish, newest, rows
 
@@ -190,7 +189,7 @@ def test_a_fault_in_the_middle_of_a_rollout_leaves_no_trace(tmp_path, monkeypatc
     assert 0 < newest(tmp_path / "parts") < 800
     assert train.train(parts) == 0
     a, b = (load_agent(tmp_path / name) for name in ("whole", "parts"))
-    jax.tree.map(np.testing.assert_array_equal, (a.params, a.statistics), (b.params, b.statistics))
+    chex.assert_trees_all_equal((a.params, a.statistics), (b.params, b.statistics))
     last, resumed = (rows(tmp_path / name)[-1] for name in ("whole", "parts"))
     assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in resumed.items() if k != "time"}
     assert "recv raised RuntimeError: gone; saved at" in capfd.readouterr().err
