@@ -204,7 +204,7 @@ class LearnerConfig:
     learning_rate: float = 1e-3
     full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
-    schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps
+    schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps, skipped updates apart
     amsgrad: bool = False  # divide by the largest second moment so far, in place of Adam's latest
     adam_b1: float = 0.9
     adam_b2: float = 0.999

@@ -35,6 +35,8 @@ def convolve(
         raise ValueError(
             f"image {x.shape[1]}x{x.shape[2]} is smaller than the kernel {kernel.shape[0]}x{kernel.shape[1]}"
         )
+    if x.shape[3] != kernel.shape[2]:
+        raise ValueError(f"image of {x.shape[3]} channels: the kernel takes {kernel.shape[2]}")
     if jax.default_backend() == "cpu" and x.shape[0] >= _MANY_IMAGES:
         return _convolve_cpu(x, kernel, stride)
     return convolve_plain(x, kernel, stride)

@@ -68,14 +68,18 @@ def sense(
         inside where it would, and then sensing takes about two thirds of the time.
 
     Raises:
-      ConfigError: a focal point of fractions; a peripheral grid finer than the frame; other bounds, or 'window' and
-        an area larger than the frame.
+      ConfigError: a frame or a focal point of another rank; a focal point of fractions; a peripheral grid finer than
+        the frame; other bounds, or 'window' and an area larger than the frame.
     """
     if bounds not in ("window", "point"):
         raise ConfigError(f"bounds={bounds}: accepted is 'window' or 'point'")
     frame, focal_point = jnp.asarray(frame), jnp.asarray(focal_point)
     if not jnp.issubdtype(focal_point.dtype, jnp.integer):
         raise ConfigError(f"focal_point={focal_point.dtype}: accepted is integers, which foajax.gaze.from_unit makes")
+    if focal_point.shape != (2,):
+        raise ConfigError(f"focal_point={list(focal_point.shape)}: accepted is (y, x), jax.vmap for more")
+    if frame.ndim not in (2, 3):
+        raise ConfigError(f"frame={list(frame.shape)}: accepted is [H, W] or [H, W, C], jax.vmap for more")
     corner = focal_point - np.array(sensor.window) // 2
     if bounds == "window":
         room = np.array(frame.shape[:2]) - sensor.window
@@ -235,7 +239,8 @@ def _place(image: Float[Array, "h w"], corner: Int[Array, "2"], frame_shape: Sha
     """Puts an image into an empty frame: the inverse of `_gather_window`."""
     # XLA reads through the padding and never lays it out.
     padded = jnp.pad(image, [(size, size) for size in frame_shape])
-    return lax.dynamic_slice(padded, np.array(frame_shape) - corner, frame_shape)
+    # A start below 0 would count from the end.
+    return lax.dynamic_slice(padded, jnp.maximum(np.array(frame_shape) - corner, 0), frame_shape)
 
 
 def _pool(window: Num[Array, "h w"], sensor: Sensor) -> tuple[Float[Array, "_ _"], ...]:

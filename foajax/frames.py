@@ -16,8 +16,8 @@ from foajax.types import FrameStatistics
 
 DECAY = 0.9999  # of the running statistics, per frame
 PIXEL_DECAY = 0.99999  # where each pixel has a mean of its own, which takes more frames to know
-EPSILON = 1e-8  # added to a deviation before dividing by it
-CROPPED = 160  # rows, and columns, kept of an Atari screen
+SMALLEST_STD = 1e-3  # a quarter of a gray level: frames of one gray have a deviation of rounding errors alone
+CROPPED = 160  # rows kept of an Atari screen
 
 
 def to_frame(screen: UInt8[Array, "h w"], crop_top: int | None) -> Float[Array, "H W"]:
@@ -39,8 +39,7 @@ def to_frame(screen: UInt8[Array, "h w"], crop_top: int | None) -> Float[Array, 
 def crop_and_halve(screen: UInt8[Array, "210 160"], crop_top: int) -> Float[Array, "80 80"]:
     """Mean of each 2x2 block of the screen rows crop_top .. crop_top + 159.
 
-    The sum of four pixels is exact, so a value is `sum / 1020` with one rounding and
-    `round(1020 * frame)` gives the sum back.
+    The sum of four pixels is exact: `round(1020 * frame)` gives it back.
 
     Args:
       screen: gray, 0..255.
@@ -120,7 +119,7 @@ def normalise(
     *,
     mode: Literal["running", "pixel", "frame", "none"],
 ) -> Float[Array, "H W"]:
-    """(frame - mean) / (std + EPSILON).
+    """(frame - mean) / max(std, SMALLEST_STD).
 
     Args:
       frame: in [0, 1].
@@ -136,7 +135,7 @@ def normalise(
     if mode == "none":
         return frame
     mean, std = frame_statistics(frame) if mode == "frame" else _corrected(statistics, frame)
-    return (frame - mean) / (std + EPSILON)
+    return (frame - mean) / jnp.maximum(std, SMALLEST_STD)
 
 
 def _corrected(statistics: FrameStatistics, frame: Float[Array, "H W"]) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ def policy_loss(
     Without `clip_ratio`, -log pi(a) A (the paper's L_policy; `behaviour_log_prob` is not used). With it, the
     clipped surrogate of PPO (Schulman et al. 2017, eq. 7), where mu is the policy that acted:
 
-        -min(ratio A, clip(ratio, 1 - clip_ratio, 1 + clip_ratio) A),  ratio = pi(a) / mu(a)
+        -min(ratio A, clip(ratio, 1 - clip_ratio, 1 + clip_ratio) A),  ratio = min(pi(a) / mu(a), e^20)
     """
     advantage = jax.lax.stop_gradient(advantage)
     log_pi = log_prob(logits, action)
@@ -73,8 +73,8 @@ def reduce_steps(
     """One number from a term of the loss, over the steps where `mask_t` is not 0.
 
     `mean` is the mean over all these steps (0 where there is none); `sum` adds them up over time, as the
-    paper does, and takes the mean over the B environments. What `x` holds elsewhere does not matter, NaN
-    included.
+    paper does, and takes the mean over the B environments. What `x` holds elsewhere does not matter to
+    the number, NaN included; a gradient of its own there has to be finite.
 
     Where the environments are spread over `shards`, of B each, with `steps` valid steps in all (`valid_steps`), the
     result is one shard's part: the parts add up to the number.

@@ -39,7 +39,7 @@ def _forward(projected: Array, kernel: Array, keep: Array, cell: Array, hidden: 
     def step(carry, inputs):
         cell, hidden = carry
         projected, keep = inputs
-        cell, hidden = cell * keep[:, None], hidden * keep[:, None]
+        cell, hidden = (jnp.where(keep[:, None] > 0, x, 0.0) for x in (cell, hidden))
         i, f, g, o = jnp.split(projected + hidden @ kernel, 4, axis=-1)
         i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
         new_cell = f * cell + i * g

@@ -1,5 +1,7 @@
 """Both forms of the convolution against each other and a NumPy loop; max-pool against a loop."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,6 +134,13 @@ def test_backend_and_batch_choose_the_form(monkeypatch):
     assert "conv_general_dilated" in str(jax.make_jaxpr(lambda x, w: convolve(x, w))(x[:1], w))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert "conv_general_dilated" in str(jax.make_jaxpr(lambda x, w: convolve(x, w))(x, w))
+
+
+@pytest.mark.parametrize("images", [1, 8])
+def test_an_image_of_other_channels_than_the_kernels_is_refused(images):
+    x, w = arrays((images, 7, 7, 64), (3, 3, 32, 5))
+    with pytest.raises(ValueError, match="image of 64 channels: the kernel takes 32"):
+        inspect.unwrap(convolve)(x, w)
 
 
 def test_an_image_smaller_than_the_kernel_is_refused():

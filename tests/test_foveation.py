@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import inspect
+import re
 
 import hypothesis.strategies as st
 import jax
@@ -209,6 +211,15 @@ def test_the_picture_of_packed_images_is_the_canvas(name):
     np.testing.assert_array_equal(same, canvas[0])
 
 
+def test_what_was_sensed_far_outside_of_a_frame_is_nowhere_in_its_picture():
+    sensor = RingSensor(((4, 4, 1),), layout="packed")
+    for y in range(-30, 40):
+        shown = picture((jnp.ones((4, 4, 1)),), jnp.array([y, 5]), sensor=sensor, frame_shape=(10, 10))
+        expected = np.zeros((10, 10, 1))
+        expected[max(0, y - 2) : max(0, y + 2), 3:7] = 1
+        np.testing.assert_array_equal(shown, expected)
+
+
 @st.composite
 def scenes(draw):
     """What makes a sensor, the shape of a frame and focal points, all of them odd."""
@@ -328,6 +339,18 @@ def test_ring_boxes_frame_what_is_shown():
     (canvas,) = jax.jit(functools.partial(sense, sensor=sensor))(jnp.ones((30, 30)), jnp.array([10, 9]))
     top, left, height, width = ring_boxes((10, 9), sensor)[-1]
     assert canvas.sum() == canvas[top : top + height, left : left + width].sum() == height * width
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3, 2)])
+def test_a_focal_point_that_is_not_one_point_is_refused(shape):
+    with pytest.raises(ConfigError, match=rf"focal_point={re.escape(str(list(shape)))}: accepted is \(y, x\)"):
+        inspect.unwrap(sense)(jnp.zeros((8, 8)), jnp.zeros(shape, int), sensor=RingSensor(((4, 4, 1),)))
+
+
+@pytest.mark.parametrize("shape", [(8,), (2, 8, 8, 3)])
+def test_a_frame_of_another_rank_is_refused(shape):
+    with pytest.raises(ConfigError, match=rf"frame={re.escape(str(list(shape)))}: accepted is \[H, W\]"):
+        inspect.unwrap(sense)(jnp.zeros(shape), jnp.array([4, 4]), sensor=RingSensor(((4, 4, 1),)))
 
 
 def test_a_grid_finer_than_the_frame_is_refused():

@@ -187,6 +187,17 @@ def test_a_black_frame_stays_finite(mode):
     np.testing.assert_array_equal(got, np.zeros((8, 8)))
 
 
+@pytest.mark.parametrize("mode", ["running", "pixel", "frame"])
+def test_frames_of_one_gray_are_not_blown_up_by_rounding_errors(mode):
+    """The mean of equal values is off by a rounding error, and so is their deviation."""
+    for gray in range(256):
+        frame = frames.to_frame(jnp.full((80, 80), gray, jnp.uint8), None)
+        seen = frames.update_statistics(
+            frames.initial_statistics((80, 80) if mode == "pixel" else ()), *frames.frame_statistics(frame), 64
+        )
+        np.testing.assert_allclose(frames.normalise(frame, seen, mode=mode), 0.0, atol=1e-3)
+
+
 def test_without_normalisation_the_frame_stays_as_it_is():
     frame = jnp.asarray([[0.25, 1.0]])
     np.testing.assert_array_equal(frames.normalise(frame, frames.initial_statistics(), mode="none"), frame)

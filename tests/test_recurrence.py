@@ -92,6 +92,14 @@ def test_no_gradient_crosses_an_episodes_start(inputs):
     assert np.all(np.any(gradient[:4, [0, 2]] != 0, axis=(0, 2)))
 
 
+def test_an_episodes_start_forgets_what_is_not_finite(inputs):
+    projected, kernel, is_first, state = inputs
+    broken = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), state)
+    hidden, _ = lstm(projected, kernel, is_first.at[0].set(True), broken)
+    expected, _ = lstm(projected, kernel, is_first.at[0].set(True), state)
+    np.testing.assert_array_equal(hidden, expected)
+
+
 def test_a_long_sequence_runs_as_a_loop():
     rng = np.random.default_rng(3)
     projected = jnp.asarray(rng.normal(size=(50, 2, 4 * L)), jnp.float32)

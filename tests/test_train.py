@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import shutil
 import signal
 import time
@@ -133,6 +134,21 @@ def test_parameters_that_do_not_fit_are_refused_in_one_line(breakout, tmp_path, 
     code, _, err = finish(*words, f"train.init_from={breakout[0] if source == 'breakout' else source}")
     assert code == 2 and len(err.splitlines()) == 1 and err.startswith("foajax: error: train.init_from="), err
     assert said in err
+
+
+def test_another_process_finds_all_compiled_programs(tmp_path):
+    """Python hashes strings differently in each process: nothing that is compiled may follow a set's order."""
+    cache = tmp_path / "cache"
+    found = []
+    for seed in (0, 7):  # two which order the metrics of the two heads differently
+        variables = {"PYTHONHASHSEED": str(seed), "JAX_COMPILATION_CACHE_DIR": str(cache)}
+        words = ["game=seek", *TINY, f"run={tmp_path / str(seed)}", "train.env_steps=40"]
+        everything = os.environ | variables | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        code, _, err = finish(*words, env=everything)
+        assert code == 0, err
+        found.append({path.name for path in cache.glob("*-cache")})
+    assert any(name.startswith("jit_update") for name in found[0])
+    assert found[0] == found[1]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
