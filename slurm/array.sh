@@ -21,7 +21,8 @@
 #SBATCH --signal=B:USR1@120   # two minutes before the time limit, to this script
 #SBATCH --open-mode=append
 #SBATCH --output=slurm-%A_%a.log
-# #SBATCH --gpus-per-task=1   # one more # removed: with the extra `cuda` the learner runs on a GPU
+# For a GPU, with the extra `cuda`, take the first # of the next line away.
+##SBATCH --gpus-per-task=1
 
 models=(nonfoa constant50_sub1 constant50_sub2 constant70 decreasing constant70_p decreasing_p)
 games=(breakout pong beam_rider)

@@ -17,7 +17,8 @@
 #SBATCH --signal=B:USR1@120   # two minutes before the time limit, to this script
 #SBATCH --open-mode=append
 #SBATCH --output=slurm-%j.log
-# #SBATCH --gpus-per-task=1   # one more # removed: with the extra `cuda`
+# For a GPU, with the extra `cuda`, take the first # of the next line away.
+##SBATCH --gpus-per-task=1
 
 # Before the time is up all processes are told to save (one would do: they stop together), and the job queues itself
 # again. Exit code 75 means that a process was lost and the others saved, one above 128 that it was a signal which took
