@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import inspect
 import json
 import os
@@ -17,6 +18,8 @@ import yaml
 from foajax.config import ConfigError, build, describe
 
 Options = TypeVar("Options")
+INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it
+_CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.EEXIST)
 
 
 def parse(options: type[Options], arguments: Sequence[str]) -> Options:
@@ -28,12 +31,26 @@ def parse(options: type[Options], arguments: Sequence[str]) -> Options:
         if not separator:
             names = ", ".join(field.name for field in dataclasses.fields(cast(Any, options)))
             raise ConfigError(f"{word}: accepted is key=value with one of {names}")
-        is_text = hints.get(key) in (str, str | None) and text not in ("", "null")
-        try:
-            values[key] = text if is_text else yaml.safe_load(text or "null")
-        except (yaml.YAMLError, ValueError):  # the latter from what looks like a date
-            raise ConfigError(f"{key}={text}: accepted is a YAML value") from None
+        values[key] = _value(key, text, hints.get(key))
     return build(options, values, "")
+
+
+def _value(key: str, text: str, hint: Any) -> Any:
+    """What a word says. YAML reads 010 as 8, 1:30 as 90 and 1e1 as text, so that numbers are Python's."""
+    kinds = set(typing.get_args(hint) or [hint]) - {type(None)}
+    if text not in ("", "null"):
+        if kinds == {str}:
+            return text
+        if kinds in ({int}, {float}):
+            number = float if float in kinds else int
+            try:
+                return number(text)
+            except ValueError:
+                return text  # which is refused in the words of the others
+    try:
+        return yaml.safe_load(text or "null")
+    except (yaml.YAMLError, ValueError):  # the latter from what looks like a date
+        raise ConfigError(f"{key}={text}: accepted is a YAML value") from None
 
 
 def check_file(key: str, path: str | None) -> None:
@@ -68,8 +85,15 @@ def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str]
     try:
         return command(words) or 0
     except ConfigError as error:
-        print(f"foajax: error: {error}", file=sys.stderr)
-        return 2
+        why = str(error)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except OSError as error:
+        if error.errno not in _CANNOT_WRITE:
+            raise
+        why = f"{error.filename or 'its files'}: cannot be written ({error.strerror})"
+    print(f"foajax: error: {why}", file=sys.stderr)
+    return 2
 
 
 def _help(module: Any) -> str:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from foajax import cli, sweep
+from foajax import cli, rundir, status, sweep
 from foajax.config import Config, ConfigError, from_mapping
 
 Task = Callable[[Config], int | None]  # returns an exit code, None for 0
@@ -51,28 +51,34 @@ def list_experiments() -> list[str]:
     return list(_choices()["experiment"])
 
 
-def run(task: Task, arguments: Sequence[str]) -> int:
+def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None] | None = None) -> int:
     """Runs `task` on the config that the command line describes; returns the exit code.
 
     A single run is composed and started directly. `--multirun` alone runs a sweep on this machine, a process of
     `foajax.train` each, `--jobs=N` at a time (1). With a `hydra/launcher` (`submitit_slurm`; `basic` for one after
     another in this process) Hydra starts `task` for each run, and other flags (`--help`, `--cfg`) are Hydra's. Every
-    run of a sweep is checked before the first one starts; one that fails does not end the sweep.
+    run of a sweep is checked, by `check` too, before the first one starts; one that fails does not end the sweep.
 
     A `ConfigError`, one that `task` raises included, becomes one line on stderr and exit code 2.
     """
     if any(word.startswith("-") for word in arguments):
-        return cli.run(functools.partial(_run_flags, task), arguments)
+        return cli.run(functools.partial(_run_flags, task, check), arguments)
     return cli.run(lambda words: task(compose(words)), arguments)
 
 
-def _run_flags(task: Task, arguments: Sequence[str]) -> int:
+def _run_flags(task: Task, check: Callable[[Config], None] | None, arguments: Sequence[str]) -> int:
     ours = [word for word in arguments if "=" in word and not word.startswith(("-", "hydra.", "hydra/"))]
     runs = _expand(ours)
     rest = [word for word in arguments if word not in ours]
     is_sweep = not {"-m", "--multirun"}.isdisjoint(rest)
     jobs = [word for word in rest if word.startswith("--jobs")]
     at_a_time = _jobs(*jobs)
+    if is_sweep:
+        if strays := [word for word in rest if not word.startswith(("-", "hydra.", "hydra/"))]:
+            raise ConfigError(f"{_one_line(strays[0])}: accepted is key=value")
+        if check is not None:
+            for each in runs:
+                check(each.config)
     if is_sweep and not set(rest) - {"-m", "--multirun", *jobs}:
         return sweep.run_all(runs, jobs=at_a_time)
     if jobs:
@@ -109,6 +115,15 @@ def _job(task: Task, swept: set[str] | None, failures: dict[str, str], node: Any
     except Exception as error:  # whatever it is, the next run starts
         failures[config.run_dir] = "exit 1"
         sys.excepthook(type(error), error, error.__traceback__)
+    else:
+        in_this_process = HydraConfig.get().launcher["_target_"].endswith("BasicLauncher")
+        if code == cli.INTERRUPTED or (in_this_process and not code and _is_left(config)):
+            raise SystemExit(code)  # it was asked to stop, and so were the runs after it
+
+
+def _is_left(config: Config) -> bool:
+    """Whether a run has begun and is not finished."""
+    return rundir.is_run(Path(config.run_dir)) and not status.is_finished(config)
 
 
 def _run_hydra(job: Callable[[Any], None], words: Sequence[str]) -> int:
@@ -179,7 +194,10 @@ def _values(word: str) -> Iterable[str]:
     if not override.is_sweep_override():
         return [word]
     if isinstance(value, Glob):
-        return [f"{key}={choice}" for choice in value.filter(list(_choices().get(key, ())))]
+        names = _choices().get(key, ())
+        if not (chosen := value.filter(list(names))):
+            raise ConfigError(f"{_one_line(word)}: accepted is what matches one of {', '.join(names) or 'no names'}")
+        return [f"{key}={choice}" for choice in chosen]
     if not override.is_discrete_sweep():
         raise ConfigError(f"{_one_line(word)}: accepted is a list of values")
     return [f"{key}={choice}" for choice in override.sweep_string_iterator()]

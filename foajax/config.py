@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 import types
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
+
+_MANY = 10**9  # of what is counted in 32 bits
 
 
 class ConfigError(ValueError):
@@ -224,8 +225,10 @@ class LearnerConfig:
             value = getattr(self, key)
             _check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
         inputs = self.full_rate_inputs
-        _check(inputs is None or inputs >= 1, "learner.full_rate_inputs", inputs, "null or an integer >= 1")
-        _check(self.warmup_updates >= 0, "learner.warmup_updates", self.warmup_updates, "an integer >= 0")
+        accepted = f"null or an integer from 1 to {_MANY}"
+        _check(inputs is None or 1 <= inputs <= _MANY, "learner.full_rate_inputs", inputs, accepted)
+        accepted = f"an integer from 0 to {_MANY}"
+        _check(0 <= self.warmup_updates <= _MANY, "learner.warmup_updates", self.warmup_updates, accepted)
         for key in ("learning_rate", "adam_eps"):
             _check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
         for key in ("adam_b1", "adam_b2"):
@@ -466,7 +469,8 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
         if value is None:
             return None
     elif hint is float:
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if is_number and (value == 0 or 1e-30 <= abs(value) <= 1e30):  # others would be 0 or infinite in float32
             return float(value)
     elif type(value) is hint:
         return value
@@ -486,5 +490,6 @@ def describe(hint: Any) -> str:
         return "[" + ", ".join(describe(a) for a in args) + "]"
     if origin is not None:
         return f"a mapping to {describe(args[1])}"
-    plain = {int: "an integer", float: "a finite number", bool: "true or false", str: "a string", type(None): "null"}
+    plain = {int: "an integer", bool: "true or false", str: "a string", type(None): "null"}
+    plain[float] = "a number (0, or of 1e-30 to 1e30)"
     return plain.get(hint, "a mapping")

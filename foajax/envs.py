@@ -16,7 +16,7 @@ with no-ops and FIRE again, ale-py with FIRE alone. Neither can be saved: a resu
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
 
@@ -96,11 +96,11 @@ class EnvPoolEnvironment:
     _over: np.ndarray  # whether it ended a game
 
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
-        import envpool  # here, because importing it takes seconds that other engines need not spend
-        from envpool.atari.registration import atari_game_list
+        import envpool  # here, as in _atari_games
 
-        game, env = atari_name(config.game, atari_game_list), config.env
-        self.crop_top = _crop_top(config, game, atari_game_list)
+        known, env = _atari_games("envpool"), config.env
+        game = atari_name(config.game, known)
+        self.crop_top = _crop_top(config, game, known)
         self._pool = envpool.make(
             envpool_id(game),
             env_type="gymnasium",
@@ -284,6 +284,24 @@ def atari_name(game: str, known: Iterable[str]) -> str:
 def envpool_id(name: str) -> str:
     """EnvPool's id of a snake-case name: BeamRider-v5 of beam_rider."""
     return "".join(part.capitalize() for part in name.split("_")) + "-v5"
+
+
+def check_game(config: Config) -> None:
+    """`ConfigError` where there is no such Atari game, or `env` does not suit it; others show once they are made."""
+    if is_atari(config):
+        known = _atari_games(config.env.engine)
+        _crop_top(config, atari_name(config.game, known), known)
+
+
+def _atari_games(engine: str) -> Sequence[str]:
+    # Imported here, because importing EnvPool takes seconds that other engines need not spend.
+    if engine == "envpool":
+        from envpool.atari.registration import atari_game_list
+
+        return atari_game_list
+    from ale_py import roms
+
+    return roms.get_all_rom_ids()
 
 
 def _crop_top(config: Config, game: str, known: Iterable[str]) -> int:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from foajax import cli
 from foajax.config import ConfigError
@@ -67,7 +68,7 @@ def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = Fals
 def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: bool) -> Games:
     """Plays `episodes` games with fixed parameters.
 
-    Every environment plays the same number of games, so that short games are not over-represented.
+    Every environment plays the same number of games, to within one, so that short games are not over-represented.
     """
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
@@ -120,9 +121,9 @@ def evaluate(arguments: Sequence[str]) -> None:
         "returns": games.returns.tolist(),
         "lengths": games.lengths.tolist(),
     }
-    _print(result)
     if options.json:
         cli.write_json("json", options.json, result)
+    _print(result)
 
 
 def standard_error(returns: np.ndarray) -> float | None:
@@ -135,8 +136,8 @@ def _print(result: dict) -> None:
     returns = np.array(result["returns"])
     error = "" if result["stderr"] is None else f"{result['stderr']:.2f}"
     table.add_row(
-        result["game"],
-        result["experiment"],
+        Text(result["game"]),  # a name may hold what rich takes for markup
+        Text(result["experiment"]),
         result["policy"],
         str(len(returns)),
         f"{returns.mean():.2f}",

@@ -27,7 +27,10 @@ class GymnasiumEnvironment:
     lives: np.ndarray | None = None
 
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
-        make = functools.partial(gymnasium.make, config.game.removeprefix("gymnasium:"), disable_env_checker=True)
+        name = config.game.removeprefix("gymnasium:")
+        if name.count(":") > 1 or name.startswith(":"):
+            raise ConfigError(f"game={config.game}: accepted is gymnasium:<id> or gymnasium:<module>:<id>")
+        make = functools.partial(gymnasium.make, name, disable_env_checker=True)
 
         def make_one() -> gymnasium.Env:
             env = make()

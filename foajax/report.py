@@ -318,12 +318,12 @@ def _make_map(run: RunData, episodes: int) -> HeatMap | None:
     """Of games played now; None where the run has nothing that could play."""
     try:
         stored = load_agent(run.path)
+        with progress_bar() as bar:
+            games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
+            heat = heatmap.heat_map([game._replace(images=()) for game in games])
     except ConfigError as error:
         _note(f"no heat map: {error}")
         return None
-    with progress_bar() as bar:
-        games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
-        heat = heatmap.heat_map([game._replace(images=()) for game in games])
     file = run.path / "render" / heatmap.FILE
     there = heatmap.read(file) if file.exists() else None
     if there is None or (there.policy != "greedy" and there.whole_games is not False):  # others were made on purpose

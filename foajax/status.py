@@ -179,8 +179,8 @@ class Options:
     once: bool = False  # print one picture and end, as where the output is no terminal
 
     def __post_init__(self) -> None:
-        if self.every <= 0:
-            raise ConfigError(f"every={self.every}: accepted is seconds > 0")
+        if not 0 < self.every <= 86_400:
+            raise ConfigError(f"every={self.every}: accepted is seconds > 0, at most 86400")
 
 
 def status(arguments: Sequence[str]) -> None:

@@ -68,6 +68,8 @@ def load_agent(path: str | Path, *, best: bool = False) -> Stored:
         agent = Agent(config, facts["num_actions"], facts["crop_top"])
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"run={path}: {_FACTS} is missing or not readable; accepted is a run or an agent") from None
+    if not isinstance(agent.num_actions, int) or agent.num_actions < 1:
+        raise ConfigError(f"run={path}: {_FACTS} has num_actions={agent.num_actions}; accepted is an integer >= 1")
     if (path / PARAMETERS).exists():
         return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
     template = jax.eval_shape(lambda: make_state(agent, 0))
@@ -77,6 +79,14 @@ def load_agent(path: str | Path, *, best: bool = False) -> Stored:
         raise ConfigError(f"run={path}: has no checkpoint yet")
     env_steps, state, _ = restored
     return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
+
+
+def check_source(path: str) -> None:
+    """`ConfigError`, about `train.init_from`, where `path` is neither a run nor an agent."""
+    try:
+        load_config(path)
+    except ConfigError as error:
+        raise ConfigError(f"train.init_from={path}: {error}") from None
 
 
 def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
@@ -151,12 +161,18 @@ def named(tree) -> dict:
     return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named.items()}
 
 
-def _read_score(file: Path) -> dict[str, Any]:
+def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
+    config = stored.agent.config
+    expected = {"game": config.game, "experiment": config.name, "env_steps": stored.env_steps}
     try:
         result = json.loads(file.read_text())
-        return {key: result[key] for key in ("mean", "stderr", "episodes", "policy")}
+        found = {key: result[key] for key in expected}
+        score = {key: result[key] for key in ("mean", "stderr", "episodes", "policy")}
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"score={file}: accepted is a file that evaluate json=<file> has written") from None
+    if found != expected:
+        raise ConfigError(f"score={file}: is of {found}; accepted is that of this agent, {expected}")
+    return score
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,8 +188,9 @@ class Options:
 def export(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
-    score = None if options.score is None else _read_score(Path(options.score))
-    save_agent(load_agent(options.run, best=options.checkpoint == "best"), Path(options.out), score)
+    stored = load_agent(options.run, best=options.checkpoint == "best")
+    score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)
+    save_agent(stored, Path(options.out), score)
     print(f"{options.out}: {PARAMETERS}, config.yaml, {_FACTS}")
 
 

@@ -27,10 +27,10 @@ from foajax.learner import Metrics
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state, use_compilation_cache
 from foajax.rollout import Collector, update_on
-from foajax.rundir import RunDir, note_failure, open_run, take_over
+from foajax.rundir import RunDir, is_run, note_failure, open_run, take_over
 from foajax.sharding import Layout
 from foajax.snapshots import snapshots
-from foajax.store import CHECKPOINTS, begin_from, save_facts
+from foajax.store import CHECKPOINTS, begin_from, check_source, save_facts
 from foajax.types import Outcome, Rollout, TrainState
 from foajax.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 
@@ -299,8 +299,8 @@ class Run:
 
     def _finish(self) -> None:
         """Saves what the last update left, before the process ends, and waits for it."""
-        if self._games is None or self._checkpoints is None:
-            return
+        if self._games is None or self._checkpoints is None or not self._env_steps:
+            return  # before the first rollout is through there is nothing to keep
         try:
             self._checkpoints.wait()
             self._save()
@@ -338,6 +338,8 @@ class Run:
     def _how_it_ends(self, stop: str | None) -> str:
         if stop is None:
             return f"done: {self._env_steps:,} env_steps"
+        if not self._env_steps:
+            return f"{stop}: before anything was learned; the same command begins anew"
         return f"{stop}: saved at {self._env_steps:,} env_steps; the same command goes on from here"
 
     def _warn(self, text: str) -> None:
@@ -398,11 +400,23 @@ def train(config: Config) -> int:
     return 0
 
 
-def _train(config: Config) -> None:
+def check(config: Config) -> None:
+    """Finds mistakes that a configuration does not show by itself; of a sweep, in all runs before the first one.
+
+    Raises:
+      ConfigError: no gaze and a focal area that is not the whole frame; no such game; no agent to begin with.
+    """
     window, frame = config.sensor.window, config.env.frame_shape
     if config.gaze.mode == "none" and window != frame:
         sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
         raise ConfigError(f"gaze.mode=none: accepted is a focal area {sizes}; or learned, frozen, random, scripted")
+    envs.check_game(config)
+    if config.train.init_from is not None and not is_run(Path(config.run_dir)):  # one that goes on does not need it
+        check_source(config.train.init_from)
+
+
+def _train(config: Config) -> None:
+    check(config)
     with contextlib.ExitStack() as resources:
         if config.profile:
             if config.train.devices > 1 or distributed.where(config):
@@ -431,4 +445,4 @@ def _train(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(compose.run(train, sys.argv[1:]))
+    sys.exit(compose.run(train, sys.argv[1:], check=check))

@@ -25,6 +25,7 @@ from foajax.curves import RunData, colours_of, draw_curves, read_run
 from foajax.foveation import pixel_count
 from foajax.report import games_of
 from foajax.rundir import FREE, load_config
+from foajax.status import newest_checkpoint
 
 KEPT = Path(__file__).parent / "runs"
 _ROWS = 500
@@ -42,7 +43,8 @@ class Options:
 def keep(path: Path, name: str | None) -> Path:
     """Copies what matters of a run."""
     run = read_run(path)
-    wanted = {"env_steps": int(run.env_steps[-1]), "policy": "sampled", "episodes": 30}
+    newest = newest_checkpoint(path) or int(run.env_steps[-1])  # rows of a run that was killed may go on beyond it
+    wanted = {"env_steps": newest, "policy": "sampled", "episodes": 30}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"evaluate run={path} json={path}/score.json"
@@ -55,14 +57,15 @@ def keep(path: Path, name: str | None) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(text)
     rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
+    rows = [row for row in rows if json.loads(row)["env_steps"] <= newest]
     chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
     (out / "metrics.jsonl").write_text("".join(rows[i] for i in chosen))
     (out / "score.json").write_text(json.dumps(run.evaluation | {"run": out.name}, indent=1) + "\n")
-    (out / "run.json").write_text(json.dumps(_facts(run), indent=1) + "\n")
+    (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
     return out
 
 
-def _facts(run: RunData) -> dict[str, Any]:
+def _facts(run: RunData, newest: int) -> dict[str, Any]:
     starts = json.loads((run.path / "run.json").read_text())["starts"]
     # What a later start changes, such as train.env_steps, is part of what has to be repeated.
     words = [word for word in starts[-1]["command"] if "=" in word and not word.startswith("run=")]
@@ -70,8 +73,8 @@ def _facts(run: RunData) -> dict[str, Any]:
         "command": f"python -m foajax.train {shlex.join(words)}",
         "starts": [{"time": start["time"], "commit": start["commit"]} for start in starts],
         "seed": run.config.seed,
-        "env_steps": int(run.env_steps[-1]),
-        "hours": round(float(run.time[-1]) / 3600, 2),
+        "env_steps": newest,
+        "hours": round(float(run.time[run.env_steps <= newest][-1]) / 3600, 2),
         **{key: starts[-1][key] for key in _MACHINE if key in starts[-1]},  # older runs do not name their devices
     }
 

@@ -284,6 +284,52 @@ def test_a_sweep_runs_every_combination_in_order(cwd, runs):
     assert sys.argv == argv
 
 
+def test_all_runs_of_a_sweep_are_checked_before_the_first_one(cwd, runs, capsys):
+    def check(config):
+        if config.game == "pnog":
+            raise ConfigError("game=pnog: accepted is a game")
+
+    for launcher in (["-m"], HERE):
+        assert run(runs.record, [*launcher, "game=seek,pnog"], check=check) == 2
+        assert capsys.readouterr().err == "foajax: error: game=pnog: accepted is a game\n" and runs == []
+
+
+@pytest.mark.parametrize(
+    "word, said",
+    [
+        ("~seed", "~seed: accepted is key=value"),
+        ("pong", "pong: accepted is key=value"),
+        ("experiment=glob(foo*)", "experiment=glob(foo*): accepted is what matches one of constant50_sub1, "),
+        ("seed=glob(*)", "seed=glob(*): accepted is what matches one of no names"),
+    ],
+)
+def test_a_word_that_no_run_comes_of_is_refused(cwd, runs, capsys, word, said):
+    for launcher in (["--multirun"], HERE):
+        assert run(runs.record, [*launcher, word]) == 2
+        err = capsys.readouterr().err
+        assert err.startswith(f"foajax: error: {said}") and len(err.splitlines()) == 1 and runs == []
+
+
+def test_a_request_to_stop_ends_a_sweep_in_one_process(cwd, runs, capsys):
+    """A run that has begun and comes back before its end was asked to stop; Ctrl-C in the middle is no failure."""
+
+    def stopped(config):
+        runs.append(config)
+        path = Path(config.run_dir)
+        path.mkdir(parents=True)
+        for name in ("config.yaml", "run.json"):
+            (path / name).touch()
+
+    def interrupted(config):
+        runs.append(config)
+        raise KeyboardInterrupt
+
+    for task in (stopped, interrupted):
+        run(task, [*HERE, "seed=1,2"])
+        assert [config.seed for config in runs] == [1]
+        runs.clear()
+
+
 def test_a_run_that_fails_does_not_end_a_sweep(cwd, runs, capsys):
     assert run(runs.record, [*HERE, "seed=0,5,6", "game=seek,brekout"]) == 1
     assert [config.seed for config in runs] == [0, 0, 5, 5, 6, 6]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
-import re
 
 import hypothesis.strategies as st
 import jax
@@ -339,18 +337,6 @@ def test_ring_boxes_frame_what_is_shown():
     (canvas,) = jax.jit(functools.partial(sense, sensor=sensor))(jnp.ones((30, 30)), jnp.array([10, 9]))
     top, left, height, width = ring_boxes((10, 9), sensor)[-1]
     assert canvas.sum() == canvas[top : top + height, left : left + width].sum() == height * width
-
-
-@pytest.mark.parametrize("shape", [(), (1,), (3, 2)])
-def test_a_focal_point_that_is_not_one_point_is_refused(shape):
-    with pytest.raises(ConfigError, match=rf"focal_point={re.escape(str(list(shape)))}: accepted is \(y, x\)"):
-        inspect.unwrap(sense)(jnp.zeros((8, 8)), jnp.zeros(shape, int), sensor=RingSensor(((4, 4, 1),)))
-
-
-@pytest.mark.parametrize("shape", [(8,), (2, 8, 8, 3)])
-def test_a_frame_of_another_rank_is_refused(shape):
-    with pytest.raises(ConfigError, match=rf"frame={re.escape(str(list(shape)))}: accepted is \[H, W\]"):
-        inspect.unwrap(sense)(jnp.zeros(shape), jnp.array([4, 4]), sensor=RingSensor(((4, 4, 1),)))
 
 
 def test_a_grid_finer_than_the_frame_is_refused():
