@@ -470,7 +470,7 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
             return None
     elif hint is float:
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if is_number and (value == 0 or 1e-30 <= abs(value) <= 1e30):  # others would be 0 or infinite in float32
+        if is_number and (value == 0 or 1e-37 <= abs(value) <= 1e38):  # others would be 0 or infinite in float32
             return float(value)
     elif type(value) is hint:
         return value
@@ -491,5 +491,5 @@ def describe(hint: Any) -> str:
     if origin is not None:
         return f"a mapping to {describe(args[1])}"
     plain = {int: "an integer", bool: "true or false", str: "a string", type(None): "null"}
-    plain[float] = "a number (0, or of 1e-30 to 1e30)"
+    plain[float] = "a number (0, or of 1e-37 to 1e38)"
     return plain.get(hint, "a mapping")
