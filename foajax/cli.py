@@ -39,14 +39,12 @@ def _value(key: str, text: str, hint: Any) -> Any:
     """What a word says. YAML reads 010 as 8, 1:30 as 90 and 1e1 as text, so that numbers are Python's."""
     kinds = set(typing.get_args(hint) or [hint]) - {type(None)}
     if text not in ("", "null"):
-        if kinds == {str}:
-            return text
-        if kinds in ({int}, {float}):
-            number = float if float in kinds else int
-            try:
-                return number(text)
-            except ValueError:
-                return text  # which is refused in the words of the others
+        for kind in (str, int, float):
+            if kinds == {kind}:
+                try:
+                    return kind(text)
+                except ValueError:
+                    return text  # which is refused in the words of the others
     try:
         return yaml.safe_load(text or "null")
     except (yaml.YAMLError, ValueError):  # the latter from what looks like a date

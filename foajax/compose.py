@@ -51,7 +51,7 @@ def list_experiments() -> list[str]:
     return list(_choices()["experiment"])
 
 
-def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None] | None = None) -> int:
+def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None] = lambda config: None) -> int:
     """Runs `task` on the config that the command line describes; returns the exit code.
 
     A single run is composed and started directly. `--multirun` alone runs a sweep on this machine, a process of
@@ -66,7 +66,7 @@ def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None]
     return cli.run(lambda words: task(compose(words)), arguments)
 
 
-def _run_flags(task: Task, check: Callable[[Config], None] | None, arguments: Sequence[str]) -> int:
+def _run_flags(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) -> int:
     ours = [word for word in arguments if "=" in word and not word.startswith(("-", "hydra.", "hydra/"))]
     runs = _expand(ours)
     rest = [word for word in arguments if word not in ours]
@@ -76,9 +76,8 @@ def _run_flags(task: Task, check: Callable[[Config], None] | None, arguments: Se
     if is_sweep:
         if strays := [word for word in rest if not word.startswith(("-", "hydra.", "hydra/"))]:
             raise ConfigError(f"{_one_line(strays[0])}: accepted is key=value")
-        if check is not None:
-            for each in runs:
-                check(each.config)
+        for each in runs:
+            check(each.config)
     if is_sweep and not set(rest) - {"-m", "--multirun", *jobs}:
         return sweep.run_all(runs, jobs=at_a_time)
     if jobs:
@@ -110,15 +109,16 @@ def _job(task: Task, swept: set[str] | None, failures: dict[str, str], node: Any
     if sweep.skip_if_finished(config):
         return
     try:
-        if code := cli.run(lambda _: task(config), ()):
-            failures[config.run_dir] = f"exit {code}"
+        code = cli.run(lambda _: task(config), ())
     except Exception as error:  # whatever it is, the next run starts
         failures[config.run_dir] = "exit 1"
         sys.excepthook(type(error), error, error.__traceback__)
-    else:
-        in_this_process = HydraConfig.get().launcher["_target_"].endswith("BasicLauncher")
-        if code == cli.INTERRUPTED or (in_this_process and not code and _is_left(config)):
-            raise SystemExit(code)  # it was asked to stop, and so were the runs after it
+        return
+    in_this_process = HydraConfig.get().launcher["_target_"].endswith("BasicLauncher")
+    if code == cli.INTERRUPTED or (in_this_process and not code and _is_left(config)):
+        raise SystemExit(code)  # it was asked to stop, and so were the runs after it
+    if code:
+        failures[config.run_dir] = f"exit {code}"
 
 
 def _is_left(config: Config) -> bool:

@@ -14,8 +14,6 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-_MANY = 10**9  # of what is counted in 32 bits
-
 
 class ConfigError(ValueError):
     """A configuration that cannot be run; the message is one line for the user."""
@@ -221,14 +219,14 @@ class LearnerConfig:
     vision: HeadConfig = HeadConfig()
 
     def __post_init__(self) -> None:
-        for key, least, most in (("rollout_length", 2, 100_000), ("minibatches", 1, 100_000), ("epochs", 1, 1000)):
+        ranges = {"rollout_length": (2, 100_000), "minibatches": (1, 100_000), "epochs": (1, 1000)}
+        ranges["warmup_updates"] = (0, 10**9)
+        for key, (least, most) in ranges.items():
             value = getattr(self, key)
             _check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
         inputs = self.full_rate_inputs
-        accepted = f"null or an integer from 1 to {_MANY}"
-        _check(inputs is None or 1 <= inputs <= _MANY, "learner.full_rate_inputs", inputs, accepted)
-        accepted = f"an integer from 0 to {_MANY}"
-        _check(0 <= self.warmup_updates <= _MANY, "learner.warmup_updates", self.warmup_updates, accepted)
+        accepted = f"null or an integer from 1 to {10**9}"
+        _check(inputs is None or 1 <= inputs <= 10**9, "learner.full_rate_inputs", inputs, accepted)
         for key in ("learning_rate", "adam_eps"):
             _check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
         for key in ("adam_b1", "adam_b2"):
@@ -490,6 +488,11 @@ def describe(hint: Any) -> str:
         return "[" + ", ".join(describe(a) for a in args) + "]"
     if origin is not None:
         return f"a mapping to {describe(args[1])}"
-    plain = {int: "an integer", bool: "true or false", str: "a string", type(None): "null"}
-    plain[float] = "a number (0, or of 1e-37 to 1e38)"
+    plain = {
+        int: "an integer",
+        float: "a number (0, or of 1e-37 to 1e38)",
+        bool: "true or false",
+        str: "a string",
+        type(None): "null",
+    }
     return plain.get(hint, "a mapping")

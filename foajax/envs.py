@@ -96,11 +96,10 @@ class EnvPoolEnvironment:
     _over: np.ndarray  # whether it ended a game
 
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
-        import envpool  # here, as in _atari_games
+        import envpool  # here, because importing it takes seconds that other engines need not spend
 
-        known, env = _atari_games("envpool"), config.env
-        game = atari_name(config.game, known)
-        self.crop_top = _crop_top(config, game, known)
+        env = config.env
+        game, self.crop_top = _atari_game(config)
         self._pool = envpool.make(
             envpool_id(game),
             env_type="gymnasium",
@@ -175,13 +174,13 @@ class AleEnvironment:
     _over: np.ndarray  # whether it ended a game
 
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
-        from ale_py import Action, roms  # here, like EnvPool
+        from ale_py import Action  # here, like EnvPool
         from ale_py.vector_env import AtariVectorEnv
 
         if render:
             raise ConfigError("env.engine=ale: accepted is envpool where screens are to be rendered in colour")
-        game, env = atari_name(config.game, roms.get_all_rom_ids()), config.env
-        self.crop_top = _crop_top(config, game, roms.get_all_rom_ids())
+        env = config.env
+        game, self.crop_top = _atari_game(config)
         self._env = AtariVectorEnv(
             game,
             num_envs,
@@ -289,19 +288,20 @@ def envpool_id(name: str) -> str:
 def check_game(config: Config) -> None:
     """`ConfigError` where there is no such Atari game, or `env` does not suit it; others show once they are made."""
     if is_atari(config):
-        known = _atari_games(config.env.engine)
-        _crop_top(config, atari_name(config.game, known), known)
+        _atari_game(config)
 
 
-def _atari_games(engine: str) -> Sequence[str]:
-    # Imported here, because importing EnvPool takes seconds that other engines need not spend.
-    if engine == "envpool":
-        from envpool.atari.registration import atari_game_list
+def _atari_game(config: Config) -> tuple[str, int]:
+    """The engine's name of the game, and the first screen row kept of it."""
+    known: Sequence[str]
+    if config.env.engine == "envpool":
+        from envpool.atari.registration import atari_game_list as known
+    else:
+        from ale_py import roms
 
-        return atari_game_list
-    from ale_py import roms
-
-    return roms.get_all_rom_ids()
+        known = roms.get_all_rom_ids()
+    game = atari_name(config.game, known)
+    return game, _crop_top(config, game, known)
 
 
 def _crop_top(config: Config, game: str, known: Iterable[str]) -> int:

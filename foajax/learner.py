@@ -183,12 +183,10 @@ def _with_information(metrics: Metrics) -> Metrics:
 
     The entropy of the mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
     """
-    kept = {name: value for name, value in metrics.items() if not name.endswith("_policy")}
+    kept = dict(metrics)
     # In the mapping's order: in a set's, which no two processes share, they would compile different programs.
-    for name, p in metrics.items():
-        head = name.removesuffix("_policy")
-        if head == name:
-            continue
+    for name in [name for name in metrics if name.endswith("_policy")]:
+        head, p = name.removesuffix("_policy"), kept.pop(name)
         kept[f"{head}_information"] = jnp.sum(jnp.where(p > 0, -p * jnp.log(p), 0.0)) - metrics[f"{head}_entropy"]
     return kept
 

@@ -89,7 +89,7 @@ class Collector:
         return [group.rollout for group in self.groups], outcomes
 
     def decide(self, state: TrainState, first_step: int) -> None:
-        """A rollout's decisions without the environments, waited for, which acting alone costs. Spoils the rows."""
+        """A rollout's decisions, waited for, without the environments: what acting costs. It spoils the rows."""
         acting = (state.params, state.statistics)
         for row in range(self._length):
             for i in range(len(self.groups)):

@@ -14,7 +14,7 @@ import hydra
 import pytest
 import yaml
 
-from foajax import sweep
+from foajax import cli, sweep
 from foajax.compose import compose, list_experiments, run
 from foajax.config import Config, ConfigError, HeadConfig, LogPolarSensor, RingSensor, to_mapping
 
@@ -324,9 +324,10 @@ def test_a_request_to_stop_ends_a_sweep_in_one_process(cwd, runs, capsys):
         runs.append(config)
         raise KeyboardInterrupt
 
-    for task in (stopped, interrupted):
-        run(task, [*HERE, "seed=1,2"])
+    for task, code in ((stopped, 0), (interrupted, cli.INTERRUPTED)):
+        assert run(task, [*HERE, "seed=1,2"]) == code
         assert [config.seed for config in runs] == [1]
+        assert "sweep of 2 runs: 0 finished, 2 unfinished, 0 failed" in capsys.readouterr().err
         runs.clear()
 
 
