@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from foajax import cli, cost
-from foajax.compose import compose
-from foajax.config import LogPolarSensor, RingSensor, Sensor
-from foajax.foveation import sense
+from foajax.config.compose import compose
+from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
+from foajax.sensors.sense import sense
 from foajax.show import PAPER
 
 TABLE_II = {name: compose([f"experiment={name}"]).sensor for name in PAPER}

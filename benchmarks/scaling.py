@@ -36,9 +36,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from foajax import cli, envs
-from foajax.compose import compose
-from foajax.config import ConfigError
+from foajax import cli
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError
+from foajax.envs import make as envs
 
 SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32
 DEVICES = (2, 4, 8)

@@ -32,13 +32,13 @@ from rich.console import Console
 from rich.table import Table
 
 from foajax import cli
-from foajax.agent import Agent
-from foajax.allocator import keep_memory
-from foajax.compose import compose
-from foajax.config import Config, ConfigError
-from foajax.programs import make_programs, make_state, use_compilation_cache
-from foajax.rollout import Collector, update_on
+from foajax.config.compose import compose
+from foajax.config.schema import Config, ConfigError
+from foajax.learning.agent import Agent
+from foajax.learning.programs import make_programs, make_state, use_compilation_cache
+from foajax.runtime import keep_memory
 from foajax.train import make_environments
+from foajax.training.collector import Collector, update_on
 
 PARTS = ("env_only", "act_only", "update_only", "end_to_end")
 

@@ -26,12 +26,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from foajax import cli
-from foajax.agent import Agent
-from foajax.allocator import keep_memory
-from foajax.compose import compose
-from foajax.config import Config, ConfigError, NetworkConfig
-from foajax.foveation import image_shapes
-from foajax.optimizer import make_optimizer
+from foajax.config.compose import compose
+from foajax.config.schema import Config, ConfigError, NetworkConfig
+from foajax.learning.agent import Agent
+from foajax.learning.optimizer import make_optimizer
+from foajax.runtime import keep_memory
+from foajax.sensors.sense import image_shapes
 from foajax.types import CoreState, NetworkOutput
 
 STEPS = 21  # T + 1
@@ -57,7 +57,7 @@ class Options:
 
 
 def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]:
-    """The network of `foajax.networks` in PyTorch's own operations, and its parameters as leaves."""
+    """The network of `foajax.networks.network` in PyTorch's own operations, and its parameters as leaves."""
     import torch
     import torch.nn.functional as F
 

@@ -19,22 +19,22 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from foajax.agent import Agent
-    from foajax.config import Config, ConfigError, LogPolarSensor, RingSensor
-    from foajax.foveation import sense
+    from foajax.config.schema import Config, ConfigError, LogPolarSensor, RingSensor
+    from foajax.learning.agent import Agent
+    from foajax.sensors.sense import sense
+    from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
     from foajax.store import load_agent
-    from foajax.wrapper import FoveatedObservation, FoveatedVectorObservation
 else:
     _HOMES = {
-        "Agent": "agent",
-        "Config": "config",
-        "ConfigError": "config",
-        "LogPolarSensor": "config",
-        "RingSensor": "config",
-        "FoveatedObservation": "wrapper",
-        "FoveatedVectorObservation": "wrapper",
+        "Agent": "learning.agent",
+        "Config": "config.schema",
+        "ConfigError": "config.schema",
+        "LogPolarSensor": "config.schema",
+        "RingSensor": "config.schema",
+        "FoveatedObservation": "sensors.wrappers",
+        "FoveatedVectorObservation": "sensors.wrappers",
         "load_agent": "store",
-        "sense": "foveation",
+        "sense": "sensors.sense",
     }
 
     def __getattr__(name: str) -> Any:

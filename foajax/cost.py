@@ -29,11 +29,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from foajax import cli, networks
-from foajax.agent import Agent
-from foajax.compose import compose, list_experiments
-from foajax.config import Config, ConfigError
-from foajax.foveation import pixel_count
+from foajax import cli
+from foajax.config.compose import compose, list_experiments
+from foajax.config.schema import Config, ConfigError
+from foajax.learning.agent import Agent
+from foajax.networks import network as networks
+from foajax.sensors.sense import pixel_count
 from foajax.types import CoreState, Params
 
 _BATCHES = (1, 32)

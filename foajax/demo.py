@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from foajax import cli
-from foajax.config import ConfigError
+from foajax.config.schema import ConfigError
+from foajax.learning.programs import use_compilation_cache
 from foajax.player import write_page
-from foajax.programs import use_compilation_cache
 from foajax.render import make_directory, play, progress_bar
-from foajax.rundir import load_config
+from foajax.runs.directory import load_config
 from foajax.store import load_agent, load_score
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for

@@ -15,8 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config import ConfigError
-from foajax.envs import Environment, make
+from foajax.config.schema import ConfigError
+from foajax.envs.make import Environment, make
 from foajax.store import Stored, load_agent
 
 _FIRST_SEED = 1_000_003  # apart from the seeds of training

@@ -20,16 +20,17 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image
 
-from foajax import cli, durable
-from foajax.config import ConfigError, LogPolarSensor
-from foajax.envs import steps_per_second
-from foajax.foveation import ring_boxes
-from foajax.gaze import NAMES
-from foajax.painting import packed, tables
-from foajax.programs import use_compilation_cache
-from foajax.recording import Recording
+from foajax import cli
+from foajax.config.schema import ConfigError, LogPolarSensor
+from foajax.envs.make import steps_per_second
+from foajax.learning.programs import use_compilation_cache
 from foajax.render import make_directory, play, progress_bar
+from foajax.runs import durable
+from foajax.sensors.gaze import NAMES
+from foajax.sensors.reconstruct import packed, tables
+from foajax.sensors.sense import ring_boxes
 from foajax.store import load_agent
+from foajax.viewing.recording import Recording
 
 PAGE = "index.html"
 _PART = 60  # steps that are compressed together; what has to be undone to show one of them
@@ -54,7 +55,7 @@ class Options:
 
 def write_page(recording: Recording, directory: Path) -> Path:
     """Writes the page of one game; returns its path."""
-    page = (Path(__file__).parent / "player.html").read_text(encoding="utf-8")
+    page = (Path(__file__).parent / "viewing" / "player.html").read_text(encoding="utf-8")
     text = json.dumps(encode(recording), separators=(",", ":")).replace("<", "\\u003c")  # no tag may end the script
     title = f"{recording.config.name} on {recording.config.game}".replace("<", "")
     file = directory / PAGE

@@ -23,13 +23,14 @@ import numpy as np
 from PIL import Image
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from foajax import cli, heatmap
-from foajax.config import ConfigError
-from foajax.envs import steps_per_second
-from foajax.programs import use_compilation_cache
-from foajax.recording import Recording, record
-from foajax.scene import Scene
+from foajax import cli
+from foajax.config.schema import ConfigError
+from foajax.envs.make import steps_per_second
+from foajax.learning.programs import use_compilation_cache
 from foajax.store import Stored, load_agent
+from foajax.viewing import heatmap
+from foajax.viewing.recording import Recording, record
+from foajax.viewing.scene import Scene
 
 _GIF_STEPS = 1000  # written at most: each takes 1.2 MB of memory
 

@@ -22,15 +22,17 @@ from urllib.parse import quote
 import numpy as np
 from matplotlib.figure import Figure
 
-from foajax import cli, cost, curves, heatmap
-from foajax.config import ConfigError, flatten, to_mapping
-from foajax.curves import RunData, read_run
-from foajax.heatmap import HeatMap
+from foajax import cli, cost
+from foajax.config.schema import ConfigError, flatten, to_mapping
 from foajax.render import make_directory, play, progress_bar
-from foajax.rundir import FREE
-from foajax.scores import Interval, interval, iqm, normalised
+from foajax.reporting import curves
+from foajax.reporting.curves import RunData, read_run
+from foajax.reporting.scores import Interval, interval, iqm, normalised
+from foajax.runs.directory import FREE
 from foajax.status import newest_checkpoint
 from foajax.store import load_agent
+from foajax.viewing import heatmap
+from foajax.viewing.heatmap import HeatMap
 
 PAGE = "index.html"
 # Figs. 7 to 9 of the paper: experiments in the order of their legends.
@@ -170,7 +172,7 @@ class Page:
 
     def write(self) -> Path:
         """Writes the page; returns its path."""
-        page = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
+        page = (Path(__file__).parent / "reporting" / "report.html").read_text(encoding="utf-8")
         file = self._directory / PAGE
         file.write_text(page.replace("{{body}}", "\n".join(self._parts)), encoding="utf-8")
         return file

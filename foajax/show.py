@@ -22,12 +22,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from foajax import cli, envs
-from foajax.compose import compose
-from foajax.config import Config, ConfigError, RingSensor, Sensor
-from foajax.drawing import draw_gaze
-from foajax.foveation import picture, pixel_count, sense
-from foajax.frames import to_frame
+from foajax import cli
+from foajax.config.compose import compose
+from foajax.config.schema import Config, ConfigError, RingSensor, Sensor
+from foajax.envs import make as envs
+from foajax.sensors.frames import to_frame
+from foajax.sensors.sense import picture, pixel_count, sense
+from foajax.viewing.style import draw_gaze
 
 PAPER = (
     "nonfoa",

@@ -28,8 +28,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from foajax import cli, rundir
-from foajax.config import Config, ConfigError
+from foajax import cli
+from foajax.config.schema import Config, ConfigError
+from foajax.runs import directory as rundir
 
 State = Literal["starting", "running", "stalled", "finished", "failed", "stopped"]
 

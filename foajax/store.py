@@ -20,12 +20,13 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from foajax import cli, durable
-from foajax.agent import Agent
-from foajax.checkpoint import Checkpoints
-from foajax.config import Config, ConfigError, flatten, to_mapping
-from foajax.programs import make_state
-from foajax.rundir import PARAMETERS, is_run, load_config
+from foajax import cli
+from foajax.config.schema import Config, ConfigError, flatten, to_mapping
+from foajax.learning.agent import Agent
+from foajax.learning.programs import make_state
+from foajax.runs import durable
+from foajax.runs.checkpoints import Checkpoints
+from foajax.runs.directory import PARAMETERS, is_run, load_config
 from foajax.types import FrameStatistics, Params, TrainState
 
 _FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration

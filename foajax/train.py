@@ -16,23 +16,26 @@ from typing import Any
 import jax
 import numpy as np
 
-from foajax import compose, distributed, envs, profiling
-from foajax.agent import Agent
-from foajax.allocator import keep_memory
-from foajax.checkpoint import Checkpoints
-from foajax.config import Config, ConfigError
-from foajax.distributed import Job, Watch
-from foajax.dump import Dump
-from foajax.learner import Metrics
-from foajax.logger import EpisodeTracker, Logger
-from foajax.programs import make_programs, make_state, use_compilation_cache
-from foajax.rollout import Collector, update_on
-from foajax.rundir import RunDir, is_run, note_failure, open_run, take_over
-from foajax.sharding import Layout
-from foajax.snapshots import snapshots
+from foajax.config import compose
+from foajax.config.schema import Config, ConfigError
+from foajax.envs import make as envs
+from foajax.launch import processes as distributed
+from foajax.launch.processes import Job, Watch
+from foajax.learning.agent import Agent
+from foajax.learning.learner import Metrics
+from foajax.learning.programs import make_programs, make_state, use_compilation_cache
+from foajax.learning.sharding import Layout
+from foajax.runs.checkpoints import Checkpoints
+from foajax.runs.directory import RunDir, is_run, note_failure, open_run, take_over
+from foajax.runs.logger import EpisodeTracker, Logger
+from foajax.runtime import keep_memory
 from foajax.store import CHECKPOINTS, begin_from, check_source, save_facts
+from foajax.training import profiling
+from foajax.training.collector import Collector, update_on
+from foajax.training.dump import Dump
+from foajax.training.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 from foajax.types import Outcome, Rollout, TrainState
-from foajax.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
+from foajax.viewing.previews import snapshots
 
 _PICTURES_EVERY = 900.0  # seconds
 _GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best

@@ -19,12 +19,12 @@ import numpy as np
 import yaml
 
 from foajax import cli
-from foajax.compose import compose
-from foajax.config import ConfigError, flatten, to_mapping
-from foajax.curves import RunData, colours_of, draw_curves, read_run
-from foajax.foveation import pixel_count
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError, flatten, to_mapping
 from foajax.report import games_of
-from foajax.rundir import FREE, load_config
+from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
+from foajax.runs.directory import FREE, load_config
+from foajax.sensors.sense import pixel_count
 from foajax.status import newest_checkpoint
 
 KEPT = Path(__file__).parent / "runs"

@@ -51,8 +51,8 @@ def untrained():
 @pytest.fixture(scope="session")
 def breakout_agent(untrained):
     """A small agent for Breakout that has learned nothing."""
-    from foajax.agent import Agent
-    from foajax.compose import compose
+    from foajax.config.compose import compose
+    from foajax.learning.agent import Agent
 
     words = ["sensor=decreasing_p_packed", "name=small", "network.dense=16", "network.lstm=16", "gaze.bounds=point"]
     return untrained(Agent(compose(words), num_actions=4, crop_top=34))
@@ -61,6 +61,6 @@ def breakout_agent(untrained):
 @pytest.fixture(scope="session")
 def recording(breakout_agent):
     """The first decisions of a game of Breakout on the real emulator."""
-    from foajax.recording import record
+    from foajax.viewing.recording import record
 
     return next(record(breakout_agent, seed=4, max_steps=130))

@@ -7,7 +7,7 @@ import pytest
 
 PROGRAM = """
 import resource, sys, threading
-from foajax.allocator import keep_memory
+from foajax.runtime import keep_memory
 if sys.argv[1] == "kept":
     assert keep_memory()
 

@@ -22,9 +22,9 @@ import numpy as np
 import optax
 import pytest
 
-from foajax import checkpoint, durable
-from foajax.checkpoint import CheckpointError, Checkpoints
-from foajax.config import ConfigError
+from foajax.config.schema import ConfigError
+from foajax.runs import durable
+from foajax.runs.checkpoints import CheckpointError, Checkpoints
 
 ROOT = Path(__file__).parents[1]
 
@@ -138,7 +138,7 @@ def test_devices_need_not_be_the_ones_it_was_saved_from(tmp_path):
     code = f"""
 import jax, jax.numpy as jnp
 from jax.sharding import NamedSharding, PartitionSpec
-from foajax.checkpoint import Checkpoints
+from foajax.runs.checkpoints import Checkpoints
 mesh = jax.make_mesh((2,), ("data",))
 place = lambda x, *spec: jax.device_put(x, NamedSharding(mesh, PartitionSpec(*spec)))
 with Checkpoints({str(tmp_path)!r}, keep=1) as checkpoints:
@@ -519,7 +519,7 @@ _SAVE_FOREVER = """
 import os, random, signal, sys, time, warnings
 warnings.simplefilter("ignore")
 import numpy as np
-from foajax.checkpoint import Checkpoints
+from foajax.runs.checkpoints import Checkpoints
 
 def save_forever(directory, report):
     with Checkpoints(directory, keep=2) as checkpoints:

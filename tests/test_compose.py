@@ -14,9 +14,10 @@ import hydra
 import pytest
 import yaml
 
-from foajax import cli, sweep
-from foajax.compose import compose, list_experiments, run
-from foajax.config import Config, ConfigError, HeadConfig, LogPolarSensor, RingSensor, to_mapping
+from foajax import cli
+from foajax.config.compose import compose, list_experiments, run
+from foajax.config.schema import Config, ConfigError, HeadConfig, LogPolarSensor, RingSensor, to_mapping
+from foajax.launch import sweep
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -437,7 +438,7 @@ def test_an_installed_wheel_brings_the_experiments_along(tmp_path):
     ).stdout.strip()  # fmt: skip
     # The dependencies are big: those of this environment are lent to the fresh one.
     Path(purelib, "lent.pth").write_text(sysconfig.get_path("purelib"))
-    code = "import foajax.compose as c; print(c.__file__, *c.list_experiments(), c.compose(['seed=7']).seed)"
+    code = "import foajax.config.compose as c; print(c.__file__, *c.list_experiments(), c.compose(['seed=7']).seed)"
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     printed = subprocess.run(
         [python, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path, env=environment

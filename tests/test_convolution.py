@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import convolution, winograd
-from foajax.convolution import convolve, convolve_plain, max_pool
+from foajax.networks import convolution, winograd
+from foajax.networks.convolution import convolve, convolve_plain, max_pool
 
 # (image, kernel, stride): the layers of both torsos at small sizes, then odd and rectangular ones.
 CASES = [

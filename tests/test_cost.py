@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import pytest
 
 from foajax import cli, cost
-from foajax.agent import Agent
-from foajax.compose import compose
-from foajax.convolution import convolve, convolve_plain
+from foajax.config.compose import compose
+from foajax.learning.agent import Agent
+from foajax.networks.convolution import convolve, convolve_plain
 
 KEYS = {
     *("experiment", "torso", "pixels_nominal", "pixels_actual", "torso_flops", "decision_flops", "params"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from foajax import cli, demo, evaluate, store
-from foajax.config import ConfigError
+from foajax.config.schema import ConfigError
 
 EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from foajax.display import Display
+from foajax.runs.display import Display
 
 ROOT = Path(__file__).parents[1]
 ROWS = (
@@ -65,7 +65,7 @@ def test_no_speed_yet_no_time_left(capsys):
 
 
 _SHOW = f"""
-from foajax.display import Display
+from foajax.runs.display import Display
 display = Display(total_env_steps=5_000_000, start=(500_000, 500.0), frame_skip=4, live=None)
 for row in {ROWS!r}:
     display.message("a [bold]message")

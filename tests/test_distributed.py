@@ -16,9 +16,10 @@ import numpy as np
 import processes
 import pytest
 
-from foajax import coordinator, distributed
-from foajax.compose import compose
-from foajax.config import ConfigError
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError
+from foajax.launch import coordinator
+from foajax.launch import processes as distributed
 from foajax.store import load_agent
 
 # 32 environments, 4 updates of 8 of them a rollout of 128 env_steps. So small an image has no torso: only the first

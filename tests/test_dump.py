@@ -11,8 +11,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 from test_learner import VIEW, Loop
 
-from foajax.dump import Dump
 from foajax.store import named
+from foajax.training.dump import Dump
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from foajax import durable
+from foajax.runs import durable
 
 
 @pytest.fixture

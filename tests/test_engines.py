@@ -11,7 +11,8 @@ import pytest
 _PLAY = """
 import sys
 import numpy as np
-from foajax import compose, envs
+from foajax.config import compose
+from foajax.envs import make as envs
 config = compose.compose(sys.argv[1:])
 environment = envs.make(config, num_envs=2, seed=config.seed)
 environment.reset()

@@ -1,4 +1,4 @@
-"""foajax.envs, with the environments behind it, on really running games."""
+"""foajax.envs.make, with the environments behind it, on really running games."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from foajax import envs, gymnasium_env, jax_envs, probes
-from foajax.config import Config, ConfigError, EnvConfig, RingSensor
+from foajax.config.schema import Config, ConfigError, EnvConfig, RingSensor
+from foajax.envs import make as envs
+from foajax.envs import probes, tasks
+from foajax.envs.gymnasium import area_weights, gray_frames
 
 ENGINES = ["envpool", "ale"]
 NOOP, FIRE, RIGHT, LEFT = range(4)  # Breakout's actions
@@ -357,10 +359,10 @@ def test_environments_differ_and_a_seed_repeats():
 def test_the_pure_functions_scanned_are_the_host_environment():
     task = probes.memory((8, 8))
     actions = random_actions(20, 1, 2).astype(np.int32)
-    host = play(jax_envs.JaxEnvironment(task, num_envs=1, seed=4), actions)
-    state, first = jax_envs.reset(task, jax.random.key(4))  # environment i has the key of seed + i
+    host = play(tasks.JaxEnvironment(task, num_envs=1, seed=4), actions)
+    state, first = tasks.reset(task, jax.random.key(4))  # environment i has the key of seed + i
     np.testing.assert_array_equal(first.frame, host.frame[0, 0])
-    _, steps = jax.lax.scan(lambda s, a: jax_envs.step(task, s, a), state, actions[:, 0])
+    _, steps = jax.lax.scan(lambda s, a: tasks.step(task, s, a), state, actions[:, 0])
     for name in ("frame", "reward", "is_first", "is_terminal"):
         np.testing.assert_array_equal(getattr(steps, name), getattr(host, name)[1:, 0])
 
@@ -526,12 +528,12 @@ def test_gymnasium_that_cannot_be_told_to_render_shows_its_images(monkeypatch):
 )
 def test_other_images_are_refused(images):
     with pytest.raises(ValueError, match=r"^images=.*\]: accepted is uint8 \[B, h, w\], "):
-        gymnasium_env.gray_frames(images, (8, 8))
+        gray_frames(images, (8, 8))
 
 
 @pytest.mark.parametrize(("source", "target"), [(160, 80), (210, 80), (96, 80), (50, 80), (80, 80)])
 def test_area_weights_are_the_covered_shares(source, target):
-    weights = gymnasium_env.area_weights(source, target)
+    weights = area_weights(source, target)
     expected = np.zeros((target, source))
     fine = source * target  # both grids' borders fall on it
     for k in range(fine):
@@ -542,6 +544,6 @@ def test_area_weights_are_the_covered_shares(source, target):
 
 def test_shrinking_is_the_area_interpolation_of_opencv():
     image = np.random.default_rng(0).integers(0, 256, (210, 96), dtype=np.uint8)
-    rows, columns = (gymnasium_env.area_weights(side, 80) for side in image.shape)
+    rows, columns = (area_weights(side, 80) for side in image.shape)
     expected = cv2.resize(image.astype(np.float32), (80, 80), interpolation=cv2.INTER_AREA)
     np.testing.assert_allclose(rows @ image @ columns.T, expected, atol=0.01)

@@ -1,4 +1,4 @@
-"""foajax.frames against loops in NumPy, hand-computed values and a recorded screen."""
+"""foajax.sensors.frames against loops in NumPy, hand-computed values and a recorded screen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import frames
+from foajax.sensors import frames
 from foajax.types import FrameStatistics
 
 # Of the 2x2 sums (little-endian uint16, row by row) of tests/data/breakout_screen.npz from row 34 on.

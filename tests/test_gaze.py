@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import gaze
-from foajax.config import ConfigError, GazeConfig
+from foajax.config.schema import ConfigError, GazeConfig
+from foajax.sensors import gaze
 
 FRAME = (80, 90)
 WINDOWS = [(70, 70), (71, 33), (80, 90), (1, 1)]

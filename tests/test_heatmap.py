@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from foajax import heatmap
-from foajax.heatmap import HeatMap
+from foajax.viewing import heatmap
+from foajax.viewing.heatmap import HeatMap
 
 
 def by_hand():

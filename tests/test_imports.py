@@ -174,7 +174,7 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
 
 
 def test_what_a_command_line_needs_imports_neither_jax_nor_hydra():
-    code = "import sys, foajax, foajax.config, foajax.compose as c; c.list_experiments(); print(*sys.modules)"
+    code = "import sys, foajax, foajax.config.compose as c; c.list_experiments(); print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=PACKAGE.parent
     )

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from foajax.compose import compose
-from foajax.config import flatten, to_mapping
-from foajax.rundir import FREE, load_config
+from foajax.config.compose import compose
+from foajax.config.schema import flatten, to_mapping
+from foajax.runs.directory import FREE, load_config
 
 SCRIPT = Path(__file__).parents[1] / "results" / "keep.py"
 spec = importlib.util.spec_from_file_location("keep", SCRIPT)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from processes import finish
 from test_config import LOG_POLAR, OUT_OF_RANGE, RINGS, SECTIONS, paths
 
-from foajax.compose import run
-from foajax.config import to_mapping
+from foajax.config.compose import run
+from foajax.config.schema import to_mapping
 
 KEYS = {".".join(path): [] for path in paths(to_mapping(RINGS))}
 KEYS |= {

@@ -6,12 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import compose, learner, losses
-from foajax.agent import Agent
-from foajax.frames import PIXEL_DECAY
-from foajax.programs import make_programs, make_state, total_updates
-from foajax.rollout import Collector, update_on
+from foajax.config import compose
+from foajax.learning import learner, losses
+from foajax.learning.agent import Agent
+from foajax.learning.programs import make_programs, make_state, total_updates
+from foajax.sensors.frames import PIXEL_DECAY
 from foajax.train import make_environments
+from foajax.training.collector import Collector, update_on
 
 # Small networks and short rollouts: most of the time goes into compiling them.
 SMALL = ["network.dense=32", "network.lstm=32", "env.num_envs=8", "learner.minibatches=2", "learner.rollout_length=6"]

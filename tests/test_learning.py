@@ -16,7 +16,7 @@ def train(run, mode, seed):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_learned_gaze_earns_more_than_frozen_and_random(tmp_path, seed):
-    """By 2 points at least: 12 is what full sight can earn, 2.5 and 3 what the others can (`foajax.seek`).
+    """By 2 points at least: 12 is what full sight can earn, 2.5 and 3 what the others can (`foajax.envs.seek`).
 
     Seeds earn 9.3 on average, with a deviation of 0.8 (docs/learning.md).
     """

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import logger as module
-from foajax.logger import EpisodeTracker, Logger
+from foajax.runs import logger as module
+from foajax.runs.logger import EpisodeTracker, Logger
 from foajax.types import Outcome
 
 ROOT = Path(__file__).parents[1]
@@ -148,7 +148,7 @@ def test_a_file_that_cannot_be_opened_is_an_error_at_the_start(tmp_path):
 
 _LOG_FOREVER = """
 import sys
-from foajax.logger import Logger
+from foajax.runs.logger import Logger
 log = Logger(sys.argv[1], total_env_steps=10**9, start_env_steps=0, live=False)
 for i in range(1, 10**9):
     log.write({"env_steps": i, "score": i / 3})
@@ -288,7 +288,7 @@ def test_a_failing_event_file_is_reported_and_tried_again(tmp_path, capsys):
 def test_tensorboard_is_imported_only_when_something_is_logged(tmp_path):
     code = f"""
 import sys
-from foajax.logger import Logger
+from foajax.runs.logger import Logger
 with Logger({str(tmp_path)!r}, total_env_steps=1, start_env_steps=0) as log:
     log.message("hello")
     assert not any(name.startswith("tensorboardX") for name in sys.modules)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import logpolar
-from foajax.config import LogPolarSensor
-from foajax.foveation import picture, ring_boxes, sense
+from foajax.config.schema import LogPolarSensor
+from foajax.sensors import logpolar
+from foajax.sensors.sense import picture, ring_boxes, sense
 
 SENSORS = {
     f"{name}-{sampling}": LogPolarSensor(**fields, sampling=sampling)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import losses
+from foajax.learning import losses
 
 T, B, A = 4, 3, 5
 INF = np.inf

@@ -16,10 +16,10 @@ import json, sys
 import gymnasium, numpy as np
 from gymnasium import spaces
 from foajax import FoveatedObservation, LogPolarSensor, RingSensor, sense
-from foajax.agent import Agent
-from foajax.compose import compose
-from foajax.config import GazeConfig
-from foajax.gymnasium_env import gray_frames
+from foajax.learning.agent import Agent
+from foajax.config.compose import compose
+from foajax.config.schema import GazeConfig
+from foajax.envs.gymnasium import gray_frames
 
 class Pixels(gymnasium.Env):
     observation_space, action_space = spaces.Box(0, 255, (16, 20), np.uint8), spaces.Discrete(2)

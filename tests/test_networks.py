@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import compose
-from foajax.config import NetworkConfig
-from foajax.networks import initial_core_state, initial_params, make_network, make_torso
+from foajax.config import compose
+from foajax.config.schema import NetworkConfig
+from foajax.networks.network import initial_core_state, initial_params, make_network, make_torso
 
 EXPERIMENTS = compose.list_experiments()
 
@@ -20,7 +20,7 @@ def build(*overrides):
 
 
 def inputs(config, steps, batch):
-    from foajax.foveation import image_shapes
+    from foajax.sensors.sense import image_shapes
 
     rng = np.random.default_rng(0)
     shapes = image_shapes(config.sensor, config.env.frame_shape)

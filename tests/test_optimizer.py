@@ -9,8 +9,8 @@ import numpy as np
 import optax
 import pytest
 
-from foajax.config import ConfigError, LearnerConfig
-from foajax.optimizer import make_optimizer
+from foajax.config.schema import ConfigError, LearnerConfig
+from foajax.learning.optimizer import make_optimizer
 
 UPDATES = 200
 SHAPES = {"dense": {"kernel": (5, 3), "bias": (3,)}, "scale": ()}

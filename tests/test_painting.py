@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax.config import LogPolarSensor, RingSensor
-from foajax.foveation import picture, sense
-from foajax.painting import packed, paint, tables
+from foajax.config.schema import LogPolarSensor, RingSensor
+from foajax.sensors.reconstruct import packed, paint, tables
+from foajax.sensors.sense import picture, sense
 
 SENSORS = {
     "rings": RingSensor(rings=((10, 12, 1), (20, 20, 2), (30, 28, 4)), peripheral=(5, 5)),

@@ -11,8 +11,8 @@ import pytest
 from browser import browser_needed, opened_page
 
 from foajax import cli, player
-from foajax.painting import packed, paint, tables
-from foajax.recording import Screens
+from foajax.sensors.reconstruct import packed, paint, tables
+from foajax.viewing.recording import Screens
 
 ARTEFACTS = Path(__file__).resolve().parent.parent / "build"
 GAZE = """() => {  // centre of all that is drawn in the colour of the focal point, in CSS pixels

@@ -6,17 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import envs, evaluate
-from foajax.agent import Agent
-from foajax.compose import compose
-from foajax.config import ConfigError
+from foajax import evaluate
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError
+from foajax.envs import make as envs
 from foajax.evaluate import play
-from foajax.frames import to_frame
-from foajax.gaze import DIRECTIONS
-from foajax.heatmap import bounds
-from foajax.painting import packed
-from foajax.recording import Screens, record
+from foajax.learning.agent import Agent
+from foajax.sensors.frames import to_frame
+from foajax.sensors.gaze import DIRECTIONS
+from foajax.sensors.reconstruct import packed
 from foajax.types import Outcome, TimeStep
+from foajax.viewing.heatmap import bounds
+from foajax.viewing.recording import Screens, record
 
 
 def test_every_row_is_there(recording):

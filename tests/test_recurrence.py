@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax.recurrence import lstm
+from foajax.networks.lstm import lstm
 from foajax.types import CoreState
 
 T, B, L = 7, 3, 4

@@ -17,8 +17,9 @@ from processes import TINY, finish, newest, rows, start, wait_for
 from safetensors.numpy import load_file
 from test_checkpoint import Trap, damage_last_byte
 
-from foajax import cli, durable, store
-from foajax.checkpoint import Checkpoints
+from foajax import cli, store
+from foajax.runs import durable
+from foajax.runs.checkpoints import Checkpoints
 from foajax.store import load_agent
 
 SEEK = ["game=seek", *TINY, "train.checkpoint_every=0.3"]

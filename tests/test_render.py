@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 
 from foajax import cli, render
-from foajax.compose import compose
-from foajax.drawing import NATURAL, RINGS
-from foajax.recording import Screens
-from foajax.scene import _MARGIN, _TOP, Scene, _dim
+from foajax.config.compose import compose
 from foajax.store import save_agent
+from foajax.viewing.recording import Screens
+from foajax.viewing.scene import _MARGIN, _TOP, Scene, _dim
+from foajax.viewing.style import NATURAL, RINGS
 
 
 def rgb(colour):

@@ -12,10 +12,12 @@ import yaml
 from browser import browser_needed, opened_page
 from PIL import Image
 
-from foajax import cli, curves, heatmap, report
-from foajax.compose import compose
-from foajax.config import ConfigError, to_mapping
-from foajax.heatmap import HeatMap
+from foajax import cli, report
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError, to_mapping
+from foajax.reporting import curves
+from foajax.viewing import heatmap
+from foajax.viewing.heatmap import HeatMap
 
 SMALL = ["network.dense=8", "network.lstm=8"]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import returns
+from foajax.learning import returns
 
 GAMMA, LAMBDA, T = 0.9, 0.7, 5
 

@@ -18,9 +18,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foajax import rundir
-from foajax.config import Config, ConfigError, LogPolarSensor, RingSensor, from_mapping, to_mapping
-from foajax.rundir import RunError, load_config, open_run
+from foajax.config.schema import Config, ConfigError, LogPolarSensor, RingSensor, from_mapping, to_mapping
+from foajax.runs import directory as rundir
+from foajax.runs.directory import RunError, load_config, open_run
 
 ROOT = Path(__file__).parents[1]
 COMMAND = ["python", "-m", "foajax.train", "game=breakout"]
@@ -125,7 +125,7 @@ def test_load_config_follows_a_moved_run(config, tmp_path):
 def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     package = tmp_path / "checkout" / "foajax"
     package.mkdir(parents=True)
-    monkeypatch.setattr(rundir, "__file__", str(package / "rundir.py"))
+    monkeypatch.setattr(rundir, "__file__", str(package / "runs" / "directory.py"))
     assert rundir._commit() is None
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
@@ -141,7 +141,7 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     (package / "file").write_text("two")
     assert rundir._commit() == f"{head}-dirty"
     installed = package / "venv" / "foajax"
-    monkeypatch.setattr(rundir, "__file__", str(installed / "rundir.py"))
+    monkeypatch.setattr(rundir, "__file__", str(installed / "runs" / "directory.py"))
     assert rundir._commit() is None
 
 
@@ -213,8 +213,8 @@ def test_the_length_of_a_run_counts_where_the_learning_rate_follows_it(config):
 
 _HOLD = """
 import sys, time
-from foajax.config import Config, RingSensor
-from foajax.rundir import RunError, open_run
+from foajax.config.schema import Config, RingSensor
+from foajax.runs.directory import RunError, open_run
 config = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)), run=sys.argv[1])
 try:
     run = open_run(config, command=[])

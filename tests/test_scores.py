@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from foajax.scores import Interval, interval, iqm, normalised
+from foajax.reporting.scores import Interval, interval, iqm, normalised
 
 
 @pytest.mark.parametrize(

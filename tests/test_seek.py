@@ -1,4 +1,4 @@
-"""foajax.seek: what can be earned, by whom, and what low resolution gives away."""
+"""foajax.envs.seek: what can be earned, by whom, and what low resolution gives away."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import jax_envs, seek
+from foajax.envs import seek, tasks
 
 TASK = seek.task((80, 80))
 STEPS = seek.LEGS * seek.LEG
@@ -23,7 +23,7 @@ def episodes() -> seek.SeekState:
 
 def play(policy) -> np.ndarray:
     """Returns of one episode in each of 64 environments; `policy(state, t)` gives the actions [64]."""
-    environment = jax_envs.JaxEnvironment(TASK, num_envs=64, seed=3)
+    environment = tasks.JaxEnvironment(TASK, num_envs=64, seed=3)
     environment.reset()
     returns = np.zeros(64)
     for t in range(STEPS):

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from foajax import cli, show
-from foajax.config import LogPolarSensor, RingSensor
+from foajax.config.schema import LogPolarSensor, RingSensor
 
 CANVAS = RingSensor(rings=((20, 20, 2), (40, 40, 4)))
 PACKED = RingSensor(rings=((20, 20, 2), (40, 40, 4)), peripheral=(5, 5), layout="packed")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from foajax.snapshots import heat_map, views
+from foajax.viewing.previews import heat_map, views
 
 
 def test_the_heat_map_is_brightest_where_the_gaze_is_most():

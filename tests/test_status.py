@@ -9,9 +9,9 @@ import pytest
 from rich.console import Console
 
 from foajax import status
-from foajax.compose import compose
-from foajax.config import ConfigError
-from foajax.rundir import open_run
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError
+from foajax.runs.directory import open_run
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 import pytest
 
-from foajax import sweep
-from foajax.compose import compose
-from foajax.config import to_mapping
+from foajax.config.compose import compose
+from foajax.config.schema import to_mapping
+from foajax.launch import sweep
 from foajax.store import load_agent
 
 # Stands in for the training command: notes when it began and ended, and does what its last word says.

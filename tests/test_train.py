@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from processes import TINY, finish, has_rows, rows, start, wait_for
 
-from foajax.checkpoint import Checkpoints
-from foajax.compose import compose
-from foajax.config import ConfigError
-from foajax.distributed import Job
-from foajax.rundir import load_config, open_run
+from foajax.config.compose import compose
+from foajax.config.schema import ConfigError
+from foajax.launch.processes import Job
+from foajax.runs.checkpoints import Checkpoints
+from foajax.runs.directory import load_config, open_run
 from foajax.store import load_agent, save_agent
 from foajax.train import Run, train
 

@@ -14,17 +14,18 @@ import chex
 import pytest
 from processes import TINY, finish, newest, rows
 
-from foajax import compose, train
-from foajax.jax_envs import JaxEnvironment
-from foajax.rundir import failure
+from foajax import train
+from foajax.config import compose
+from foajax.envs.tasks import JaxEnvironment
+from foajax.runs.directory import failure
 from foajax.store import load_agent
-from foajax.watchdog import FAULT, EnvironmentFault, Watchdog
+from foajax.training.watchdog import FAULT, EnvironmentFault, Watchdog
 
 TESTS = Path(__file__).parent
 
 _SCRIPT = """
 import signal, time
-from foajax import watchdog as module
+from foajax.training import watchdog as module
 
 module.GRACE = 1.0  # of 5
 

@@ -10,8 +10,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset
 
-from foajax.config import ConfigError, GazeConfig, RingSensor
-from foajax.wrapper import FoveatedObservation, FoveatedVectorObservation
+from foajax.config.schema import ConfigError, GazeConfig, RingSensor
+from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
 
 FULL = RingSensor(rings=((6, 6, 1),), layout="packed")
 NESTED = RingSensor(rings=((4, 4, 1), (8, 8, 2)), layout="packed")

@@ -1,0 +1,170 @@
+"""The runs of a sweep on this machine: a process each, some at a time, so that none can take another down.
+
+What is finished is skipped, what is unfinished goes on, what fails is listed in the end and the others are run
+nevertheless. A signal goes on to the running processes, which save; no further one is started.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+from foajax import status
+from foajax.config.schema import Config
+from foajax.runs import directory as rundir
+from foajax.training.watchdog import STOPS
+
+_POLL = 0.1  # seconds between two looks at the running processes
+_OUTPUT = "output.txt"  # of a run beside others, in its directory
+
+
+class Run(NamedTuple):
+    """One run of a sweep."""
+
+    words: tuple[str, ...]  # its command line
+    config: Config
+
+
+class _Stop:
+    """Passes signals on to the running processes and remembers that there was one."""
+
+    def __init__(self) -> None:
+        self.requested: int | None = None  # the signal
+        self.processes: dict[str, subprocess.Popen] = {}  # by run directory
+
+    def add(self, directory: str, process: subprocess.Popen) -> None:
+        """A process that has been started; what came meanwhile is passed on to it."""
+        self.processes[directory] = process
+        if self.requested is not None:
+            process.send_signal(self.requested)
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        before = {number: signal.signal(number, self._pass_on) for number in STOPS}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+        self.requested = number
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.send_signal(number)
+
+
+def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.executable, "-m", "foajax.train")) -> int:
+    """Runs `command` with each run's words, `jobs` at a time; 0 unless one failed.
+
+    One at a time, a run has the terminal and the machine; beside others it writes to ``output.txt`` in its directory
+    and has its share of the processor's cores.
+    """
+    waiting = deque(run for run in runs if not skip_if_finished(run.config))
+    failures: dict[str, str] = {}
+    shares = deque(shares_of_cores(min(jobs, len(waiting) or 1)))  # few runs are not to leave cores idle
+    taken: dict[str, set[int]] = {}  # by run directory
+    stop = _Stop()
+    with stop.listening():
+        while stop.processes or (waiting and not stop.requested):
+            while waiting and len(stop.processes) < jobs and not stop.requested:
+                run = waiting.popleft()
+                _say(f"{run.config.run_dir}: starting")
+                taken[run.config.run_dir] = cores = shares.popleft()
+                try:
+                    with _on(cores):
+                        process = _start(run, command, alone=jobs == 1)
+                    stop.add(run.config.run_dir, process)
+                except OSError as error:
+                    shares.append(taken.pop(run.config.run_dir))
+                    failures[run.config.run_dir] = f"cannot be started ({error})"
+            time.sleep(_POLL)
+            for directory, process in list(stop.processes.items()):
+                if (code := process.poll()) is not None:
+                    del stop.processes[directory]
+                    shares.append(taken.pop(directory))
+                    # Whoever is told to stop before it can save is not at fault.
+                    if code and not (stop.requested and -code in STOPS):
+                        ended = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit {code}"
+                        failures[directory] = ended if jobs == 1 else f"{ended} (see {_OUTPUT} there)"
+    return summarise([run.config for run in runs], failures)
+
+
+def shares_of_cores(jobs: int) -> list[set[int]]:
+    """Which of this process's cores each of `jobs` runs has, as equal as can be; empty sets where a system cannot say.
+
+    A run on its own cores does not wait at every small product for threads that another run keeps from starting.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return [set() for _ in range(jobs)]
+    cores = sorted(os.sched_getaffinity(0))
+    return [set(cores[job % len(cores) :: jobs]) for job in range(jobs)]
+
+
+def skip_if_finished(config: Config) -> bool:
+    """Whether there is nothing left to do for a run, which is said."""
+    if status.is_finished(config):
+        _say(f"{config.run_dir}: finished already")
+        return True
+    return False
+
+
+def summarise(configs: Sequence[Config], failures: Mapping[str, str]) -> int:
+    """Lists what failed and what is not finished; 1 where something failed, else 0.
+
+    `failures` has what is known about some run directories beside what they say themselves.
+    """
+    lines, failed = [], 0
+    for config in configs:
+        directory = config.run_dir
+        if directory not in failures and status.is_finished(config):
+            continue
+        reasons = [failures.get(directory), rundir.failure(Path(directory))]
+        failed += any(reasons)
+        lines.append(": ".join(filter(None, ["failed" if any(reasons) else "unfinished", directory, *reasons])))
+    counts = f"{len(configs) - len(lines)} finished, {len(lines) - failed} unfinished, {failed} failed"
+    _say(f"sweep of {len(configs)} runs: {counts}" + ("; the same command goes on from here" if lines else ""))
+    for line in lines:
+        _say(f"  {line}")
+    return 1 if failed else 0
+
+
+@contextlib.contextmanager
+def _on(cores: set[int]) -> Iterator[None]:
+    """What starts meanwhile runs on these cores."""
+    if not cores:
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen:
+    # In a process group of its own: the terminal's Ctrl-C comes once, from us.
+    rundir.forget_failure(Path(run.config.run_dir))
+    words = [*command, *run.words]
+    if alone:
+        return subprocess.Popen(words, process_group=0)
+    path = Path(run.config.run_dir)
+    path.mkdir(parents=True, exist_ok=True)
+    with (path / _OUTPUT).open("ab") as output:
+        return subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, process_group=0
+        )
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
