@@ -21,9 +21,9 @@ __all__ = [
 if TYPE_CHECKING:
     from foajax.config.schema import Config, ConfigError, LogPolarSensor, RingSensor
     from foajax.learning.agent import Agent
+    from foajax.runs.agents import load_agent
     from foajax.sensors.sense import sense
     from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
-    from foajax.store import load_agent
 else:
     _HOMES = {
         "Agent": "learning.agent",

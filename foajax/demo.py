@@ -17,8 +17,8 @@ from foajax.config.schema import ConfigError
 from foajax.learning.programs import use_compilation_cache
 from foajax.player import write_page
 from foajax.render import make_directory, play, progress_bar
+from foajax.runs.agents import load_agent, load_score
 from foajax.runs.directory import load_config
-from foajax.store import load_agent, load_score
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
 

@@ -17,7 +17,7 @@ from rich.text import Text
 from foajax import cli
 from foajax.config.schema import ConfigError
 from foajax.envs.make import Environment, make
-from foajax.store import Stored, load_agent
+from foajax.runs.agents import Stored, load_agent
 
 _FIRST_SEED = 1_000_003  # apart from the seeds of training
 _SEEDS = 2**31 - 2_000_000  # the engines take 32 bits, and add an environment's number

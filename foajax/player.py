@@ -26,10 +26,10 @@ from foajax.envs.make import steps_per_second
 from foajax.learning.programs import use_compilation_cache
 from foajax.render import make_directory, play, progress_bar
 from foajax.runs import durable
+from foajax.runs.agents import load_agent
 from foajax.sensors.gaze import NAMES
 from foajax.sensors.reconstruct import packed, tables
 from foajax.sensors.sense import ring_boxes
-from foajax.store import load_agent
 from foajax.viewing.recording import Recording
 
 PAGE = "index.html"

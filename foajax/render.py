@@ -27,7 +27,7 @@ from foajax import cli
 from foajax.config.schema import ConfigError
 from foajax.envs.make import steps_per_second
 from foajax.learning.programs import use_compilation_cache
-from foajax.store import Stored, load_agent
+from foajax.runs.agents import Stored, load_agent
 from foajax.viewing import heatmap
 from foajax.viewing.recording import Recording, record
 from foajax.viewing.scene import Scene

@@ -28,9 +28,9 @@ from foajax.render import make_directory, play, progress_bar
 from foajax.reporting import curves
 from foajax.reporting.curves import RunData, read_run
 from foajax.reporting.scores import Interval, interval, iqm, normalised
+from foajax.runs.agents import load_agent
 from foajax.runs.directory import FREE
-from foajax.status import newest_checkpoint
-from foajax.store import load_agent
+from foajax.runs.status import newest_checkpoint
 from foajax.viewing import heatmap
 from foajax.viewing.heatmap import HeatMap
 

@@ -25,14 +25,15 @@ from foajax.learning.agent import Agent
 from foajax.learning.learner import Metrics
 from foajax.learning.programs import make_programs, make_state, use_compilation_cache
 from foajax.learning.sharding import Layout
+from foajax.runs.agents import CHECKPOINTS, begin_from, check_source, save_facts
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import RunDir, is_run, note_failure, open_run, take_over
-from foajax.runs.logger import EpisodeTracker, Logger
+from foajax.runs.logger import Logger
 from foajax.runtime import keep_memory
-from foajax.store import CHECKPOINTS, begin_from, check_source, save_facts
 from foajax.training import profiling
 from foajax.training.collector import Collector, update_on
 from foajax.training.dump import Dump
+from foajax.training.episodes import EpisodeTracker
 from foajax.training.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
 from foajax.types import Outcome, Rollout, TrainState
 from foajax.viewing.previews import snapshots

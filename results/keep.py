@@ -24,8 +24,8 @@ from foajax.config.schema import ConfigError, flatten, to_mapping
 from foajax.report import games_of
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.runs.directory import FREE, load_config
+from foajax.runs.status import newest_checkpoint
 from foajax.sensors.sense import pixel_count
-from foajax.status import newest_checkpoint
 
 KEPT = Path(__file__).parent / "runs"
 _ROWS = 500

@@ -37,7 +37,7 @@ def no_process_is_left():
 @pytest.fixture(scope="session")
 def untrained():
     """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
-    from foajax.store import Stored
+    from foajax.runs.agents import Stored
 
     def make(agent, env_steps=0):
         random = np.random.default_rng(0)

@@ -20,7 +20,7 @@ from foajax.config.compose import compose
 from foajax.config.schema import ConfigError
 from foajax.launch import coordinator
 from foajax.launch import processes as distributed
-from foajax.store import load_agent
+from foajax.runs.agents import load_agent
 
 # 32 environments, 4 updates of 8 of them a rollout of 128 env_steps. So small an image has no torso: only the first
 # of several processes finds compiled programs again, and what a torso does with its share is tested elsewhere.

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 from test_learner import VIEW, Loop
 
-from foajax.store import named
+from foajax.runs.agents import named
 from foajax.training.dump import Dump
 
 

@@ -11,7 +11,7 @@ import time
 import pytest
 from processes import TINY, finish, newest, rows, start, wait_for
 
-from foajax.store import load_agent
+from foajax.runs.agents import load_agent
 
 WORDS = [
     "game=seek",

@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 
 from foajax.runs import logger as module
-from foajax.runs.logger import EpisodeTracker, Logger
+from foajax.runs.logger import Logger
+from foajax.training.episodes import EpisodeTracker
 from foajax.types import Outcome
 
 ROOT = Path(__file__).parents[1]

@@ -19,8 +19,8 @@ from test_checkpoint import Trap, damage_last_byte
 
 from foajax import cli, store
 from foajax.runs import durable
+from foajax.runs.agents import load_agent
 from foajax.runs.checkpoints import Checkpoints
-from foajax.store import load_agent
 
 SEEK = ["game=seek", *TINY, "train.checkpoint_every=0.3"]
 

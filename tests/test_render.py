@@ -9,7 +9,7 @@ from PIL import Image
 
 from foajax import cli, render
 from foajax.config.compose import compose
-from foajax.store import save_agent
+from foajax.runs.agents import save_agent
 from foajax.viewing.recording import Screens
 from foajax.viewing.scene import _MARGIN, _TOP, Scene, _dim
 from foajax.viewing.style import NATURAL, RINGS

@@ -19,8 +19,9 @@ import pytest
 import yaml
 
 from foajax.config.schema import Config, ConfigError, LogPolarSensor, RingSensor, from_mapping, to_mapping
-from foajax.runs import directory as rundir
-from foajax.runs.directory import RunError, load_config, open_run
+from foajax.runs import provenance
+from foajax.runs.directory import load_config, open_run
+from foajax.runs.lock import RunError
 
 ROOT = Path(__file__).parents[1]
 COMMAND = ["python", "-m", "foajax.train", "game=breakout"]
@@ -125,8 +126,8 @@ def test_load_config_follows_a_moved_run(config, tmp_path):
 def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     package = tmp_path / "checkout" / "foajax"
     package.mkdir(parents=True)
-    monkeypatch.setattr(rundir, "__file__", str(package / "runs" / "directory.py"))
-    assert rundir._commit() is None
+    monkeypatch.setattr(provenance, "__file__", str(package / "runs" / "provenance.py"))
+    assert provenance._commit() is None
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
     (package / "file").write_text("one")
@@ -137,12 +138,12 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     ):
         subprocess.run(["git", *words], cwd=package.parent, check=True)
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=package, capture_output=True, text=True).stdout.strip()
-    assert rundir._commit() == head
+    assert provenance._commit() == head
     (package / "file").write_text("two")
-    assert rundir._commit() == f"{head}-dirty"
+    assert provenance._commit() == f"{head}-dirty"
     installed = package / "venv" / "foajax"
-    monkeypatch.setattr(rundir, "__file__", str(installed / "runs" / "directory.py"))
-    assert rundir._commit() is None
+    monkeypatch.setattr(provenance, "__file__", str(installed / "runs" / "provenance.py"))
+    assert provenance._commit() is None
 
 
 # What may change between two starts
@@ -214,7 +215,8 @@ def test_the_length_of_a_run_counts_where_the_learning_rate_follows_it(config):
 _HOLD = """
 import sys, time
 from foajax.config.schema import Config, RingSensor
-from foajax.runs.directory import RunError, open_run
+from foajax.runs.lock import RunError
+from foajax.runs.directory import open_run
 config = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)), run=sys.argv[1])
 try:
     run = open_run(config, command=[])

@@ -9,7 +9,7 @@ import time
 import pytest
 from processes import TINY, newest, start
 
-from foajax.store import load_agent
+from foajax.runs.agents import load_agent
 
 
 @pytest.mark.slow

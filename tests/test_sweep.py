@@ -15,7 +15,7 @@ import pytest
 from foajax.config.compose import compose
 from foajax.config.schema import to_mapping
 from foajax.launch import sweep
-from foajax.store import load_agent
+from foajax.runs.agents import load_agent
 
 # Stands in for the training command: notes when it began and ended, and does what its last word says.
 STAND_IN = """

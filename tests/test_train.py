@@ -16,9 +16,9 @@ from processes import TINY, finish, has_rows, rows, start, wait_for
 from foajax.config.compose import compose
 from foajax.config.schema import ConfigError
 from foajax.launch.processes import Job
+from foajax.runs.agents import load_agent, save_agent
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import load_config, open_run
-from foajax.store import load_agent, save_agent
 from foajax.train import Run, train
 
 

@@ -17,8 +17,8 @@ from processes import TINY, finish, newest, rows
 from foajax import train
 from foajax.config import compose
 from foajax.envs.tasks import JaxEnvironment
+from foajax.runs.agents import load_agent
 from foajax.runs.directory import failure
-from foajax.store import load_agent
 from foajax.training.watchdog import FAULT, EnvironmentFault, Watchdog
 
 TESTS = Path(__file__).parent

@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from foajax import cli, status
+from foajax import cli
 from foajax.config.schema import Config, ConfigError, from_mapping
 from foajax.launch import sweep
-from foajax.runs import directory as rundir
+from foajax.runs.directory import is_run
+from foajax.runs.status import is_finished
 
 Task = Callable[[Config], int | None]  # returns an exit code, None for 0
 
@@ -125,7 +126,7 @@ def _job(task: Task, swept: set[str] | None, failures: dict[str, str], node: Any
 
 def _is_left(config: Config) -> bool:
     """Whether a run has begun and is not finished."""
-    return rundir.is_run(Path(config.run_dir)) and not status.is_finished(config)
+    return is_run(Path(config.run_dir)) and not is_finished(config)
 
 
 def _run_hydra(job: Callable[[Any], None], words: Sequence[str]) -> int:

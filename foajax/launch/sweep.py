@@ -18,9 +18,9 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from foajax import status
 from foajax.config.schema import Config
-from foajax.runs import directory as rundir
+from foajax.runs.directory import failure, forget_failure
+from foajax.runs.status import is_finished
 from foajax.training.watchdog import STOPS
 
 _POLL = 0.1  # seconds between two looks at the running processes
@@ -112,7 +112,7 @@ def shares_of_cores(jobs: int) -> list[set[int]]:
 
 def skip_if_finished(config: Config) -> bool:
     """Whether there is nothing left to do for a run, which is said."""
-    if status.is_finished(config):
+    if is_finished(config):
         _say(f"{config.run_dir}: finished already")
         return True
     return False
@@ -126,9 +126,9 @@ def summarise(configs: Sequence[Config], failures: Mapping[str, str]) -> int:
     lines, failed = [], 0
     for config in configs:
         directory = config.run_dir
-        if directory not in failures and status.is_finished(config):
+        if directory not in failures and is_finished(config):
             continue
-        reasons = [failures.get(directory), rundir.failure(Path(directory))]
+        reasons = [failures.get(directory), failure(Path(directory))]
         failed += any(reasons)
         lines.append(": ".join(filter(None, ["failed" if any(reasons) else "unfinished", directory, *reasons])))
     counts = f"{len(configs) - len(lines)} finished, {len(lines) - failed} unfinished, {failed} failed"
@@ -154,7 +154,7 @@ def _on(cores: set[int]) -> Iterator[None]:
 
 def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen:
     # In a process group of its own: the terminal's Ctrl-C comes once, from us.
-    rundir.forget_failure(Path(run.config.run_dir))
+    forget_failure(Path(run.config.run_dir))
     words = [*command, *run.words]
     if alone:
         return subprocess.Popen(words, process_group=0)

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 
 from foajax.config.schema import Config, ConfigError
 from foajax.reporting.scores import CONFIDENCE, RESAMPLES, Interval
-from foajax.runs.directory import load_config, parse_row
+from foajax.runs.directory import load_config
+from foajax.runs.rows import parse_row
 from foajax.viewing.style import STYLE
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")

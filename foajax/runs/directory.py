@@ -5,23 +5,15 @@
     lock          locked by the process that trains; names it
     failure.txt   why the last start failed, where it did
 
-Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (checkpoint).
+Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (checkpoints).
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
-import fcntl
-import importlib.metadata
 import json
-import math
 import os
-import platform
-import socket
-import subprocess
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,23 +22,12 @@ import yaml
 
 from foajax.config.schema import Config, ConfigError, flatten, from_mapping, to_mapping
 from foajax.runs import durable
+from foajax.runs.lock import RunError, reason_of, take_lock
+from foajax.runs.provenance import RECORD, record_start
 
 PARAMETERS = "agent.safetensors"  # of a shipped agent, which is no run
 _CONFIG = "config.yaml"
-_RECORD = "run.json"
 _FAILURE = "failure.txt"
-_PACKAGES = (
-    "foajax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "numpy",
-    "envpool",
-    "ale-py",
-    "gymnasium",
-)
 # Keys that runs have not always had, and what was done before: older runs are read as they were made.
 _BEFORE = {
     "network": {"lstm_norm": False, "padding": "valid", "focal_point": "packed"},
@@ -59,10 +40,6 @@ FREE = {
     *("train.max_skipped", "train.dump_skipped"),
     *("train.devices", *(f"distributed.{key}" for key in ("coordinator", "processes", "process", "timeout"))),
 }
-
-
-class RunError(ConfigError):
-    """A run directory that cannot be used; the message is one line for the user."""
 
 
 class RunDir:
@@ -108,18 +85,18 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
     except FileExistsError:
         raise RunError(f"run={path}: is a file; accepted is a directory") from None
     except (OSError, ValueError) as error:
-        raise RunError(f"run={path}: cannot be created ({_reason(error)}); choose another run=<dir>") from None
+        raise RunError(f"run={path}: cannot be created ({reason_of(error)}); choose another run=<dir>") from None
     if os.path.lexists(path / PARAMETERS):
         accepted = f"another run=<dir>, with train.init_from={path} to begin from its parameters"
         raise RunError(f"run={path}: is a shipped agent; accepted is {accepted}")
-    run_dir = RunDir(path, _take_lock(path))
+    run_dir = RunDir(path, take_lock(path))
     try:
         _settle_config(path, config)
-        _record_start(path, command, devices)
+        record_start(path, command, devices)
         (path / _FAILURE).unlink(missing_ok=True)
     except OSError as error:
         run_dir.close()
-        raise RunError(f"run={path}: cannot be used ({_reason(error)}); choose another run=<dir>") from None
+        raise RunError(f"run={path}: cannot be used ({reason_of(error)}); choose another run=<dir>") from None
     except BaseException:
         run_dir.close()
         raise
@@ -129,7 +106,7 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
 def take_over(path: Path) -> RunDir | None:
     """Holds the directory of a run that nobody holds any more; None where somebody does or it cannot be seen."""
     try:
-        return RunDir(path, _take_lock(path)) if is_run(path) else None
+        return RunDir(path, take_lock(path)) if is_run(path) else None
     except RunError:
         return None
 
@@ -157,27 +134,15 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     except ConfigError as error:
         raise RunError(f"{file}: {error}") from None
     except OSError as error:
-        raise RunError(f"{file}: cannot be read ({_reason(error)})") from None
+        raise RunError(f"{file}: cannot be read ({reason_of(error)})") from None
     except Exception as error:  # a file of any content ends up here
-        raise RunError(f"{file}: is not the configuration of a run ({_reason(error)})") from None
+        raise RunError(f"{file}: is not the configuration of a run ({reason_of(error)})") from None
     return dataclasses.replace(config, run=str(path))
 
 
 def is_run(path: Path) -> bool:
     """Whether `path` is the directory of a run that has been started."""
-    return (path / _CONFIG).is_file() and (path / _RECORD).is_file()
-
-
-def is_held(path: Path) -> bool:
-    """Whether a process has the run in `path` open, on this machine or on another that shares its files."""
-    try:
-        with (path / "lock").open("rb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
+    return (path / _CONFIG).is_file() and (path / RECORD).is_file()
 
 
 def note_failure(path: Path, why: str) -> None:
@@ -204,37 +169,6 @@ def describe_error(error: Exception) -> str:
     """An error in one line: the text of what the user can mend, else its type as well."""
     text = " ".join(str(error).split())
     return text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}"
-
-
-def _take_lock(path: Path) -> int:
-    try:
-        lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise RunError(f"run={path}: cannot be written ({_reason(error)}); choose another run=<dir>") from None
-    try:
-        _lock(lock)
-        os.ftruncate(lock, 0)
-        os.write(lock, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
-    except BlockingIOError:
-        holder = os.read(lock, 200).decode(errors="replace").strip() or "another process"
-        os.close(lock)
-        raise RunError(f"run={path}: in use by {holder}; end it or choose another run=<dir>") from None
-    except OSError as error:
-        os.close(lock)
-        raise RunError(f"run={path}: cannot be locked ({_reason(error)}); choose another run=<dir>") from None
-    return lock
-
-
-def _lock(descriptor: int) -> None:
-    """The kernel's lock; BlockingIOError where another process has it for longer than a look (`is_held`) takes."""
-    for wait in (0.01, 0.05, 0.2, None):
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            if wait is None:
-                raise
-        time.sleep(wait)
 
 
 def _settle_config(path: Path, config: Config) -> None:
@@ -271,77 +205,5 @@ def _has_begun(path: Path) -> bool:
     return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
 
 
-def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
-    """A row of ``metrics.jsonl`` with finite ``env_steps``, ``time`` and `more`; None where it is torn or none."""
-    try:
-        row = json.loads(line)
-        return row if all(math.isfinite(row[key]) for key in ("env_steps", "time", *more)) else None
-    except (ValueError, RecursionError, LookupError, TypeError, OverflowError):
-        return None
-
-
 def _show(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
-
-
-def _record_start(path: Path, command: Sequence[str], devices: Sequence[str]) -> None:
-    file = path / _RECORD
-    try:
-        record = json.loads(file.read_text(encoding="utf-8")) if os.path.lexists(file) else {"starts": []}
-        record["starts"].append(_describe_start(command, devices))
-    except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
-        raise RunError(f"{file}: is not the record of a run; move it away") from None
-    durable.replace(file, (json.dumps(record, indent=1) + "\n").encode())
-
-
-def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str, Any]:
-    return {
-        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": list(command),
-        "directory": os.getcwd(),
-        "commit": _commit(),
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
-        "host": socket.gethostname(),
-        "process": os.getpid(),
-        "system": platform.platform(),
-        "cpu": _cpu(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "devices": list(devices),
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _commit() -> str | None:
-    """The commit of the checkout this package runs from, with "-dirty" after changes; None elsewhere."""
-    package = Path(__file__).resolve().parents[1]
-    # An installed package may lie inside the checkout of something else.
-    if not (package.parent / ".git").exists():
-        return None
-    words = ["git", "-C", str(package), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        result = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return result.stdout.strip() or None
-
-
-def _cpu() -> str:
-    """The processor's model where the system says it, else its architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
-    except OSError:
-        lines = []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.machine()
-
-
-def _reason(error: Exception) -> str:
-    text = getattr(error, "strerror", None) or " ".join(str(error).split())
-    return text if len(text) <= 200 else text[:197] + "..."

@@ -84,3 +84,23 @@ def _parse(text: str) -> dict[str, str]:
     """Digest by name."""
     pairs = (line.partition("  ") for line in text.splitlines())
     return {name: digest for digest, _, name in pairs if name}
+
+
+class WholeFile:
+    """A file to which content is added whole or, with an OSError, not at all."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+
+    def append(self, content: bytes) -> None:
+        size = os.fstat(self._file).st_size
+        try:
+            rest = memoryview(content)
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+        except OSError:
+            os.ftruncate(self._file, size)
+            raise
+
+    def close(self) -> None:
+        os.close(self._file)

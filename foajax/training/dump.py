@@ -17,7 +17,7 @@ import jax
 from safetensors.numpy import save
 
 from foajax.runs import durable
-from foajax.store import named
+from foajax.runs.agents import named
 from foajax.types import Params, Rollout
 
 _MOST = 5  # files a start of a run: a disk is not to be filled with one mistake

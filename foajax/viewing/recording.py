@@ -16,9 +16,9 @@ from foajax import evaluate
 from foajax.config.schema import Config
 from foajax.envs import make as envs
 from foajax.learning.agent import Agent
+from foajax.runs.agents import Stored
 from foajax.sensors.reconstruct import packed
 from foajax.sensors.sense import sense
-from foajax.store import Stored
 from foajax.types import ActorOutput, ActorState, FrameStatistics, NetworkOutput, Params, TimeStep
 
 Progress = Callable[[int, float], None]  # told the steps played so far and the score
