@@ -38,7 +38,7 @@ from typing import IO, Any, Literal
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.envs import make as envs
 
 SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 
 _EVERY = 1.0  # seconds between two looks
 

@@ -33,7 +33,8 @@ from rich.table import Table
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_programs, make_state, use_compilation_cache
 from foajax.runtime import keep_memory

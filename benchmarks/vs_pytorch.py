@@ -27,7 +27,8 @@ import numpy as np
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.schema import Config, ConfigError, NetworkConfig
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config, NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.learning.optimizer import make_optimizer
 from foajax.runtime import keep_memory

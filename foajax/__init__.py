@@ -19,7 +19,8 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from foajax.config.schema import Config, ConfigError, LogPolarSensor, RingSensor
+    from foajax.config.parse import ConfigError
+    from foajax.config.schema import Config, LogPolarSensor, RingSensor
     from foajax.learning.agent import Agent
     from foajax.runs.agents import load_agent
     from foajax.sensors.sense import sense
@@ -28,7 +29,7 @@ else:
     _HOMES = {
         "Agent": "learning.agent",
         "Config": "config.schema",
-        "ConfigError": "config.schema",
+        "ConfigError": "config.parse",
         "LogPolarSensor": "config.schema",
         "RingSensor": "config.schema",
         "FoveatedObservation": "sensors.wrappers",

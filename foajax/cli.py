@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import yaml
 
-from foajax.config.schema import ConfigError, build, describe
+from foajax.config.parse import ConfigError, build, describe
 
 Options = TypeVar("Options")
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it

@@ -31,7 +31,8 @@ from rich.table import Table
 
 from foajax import cli
 from foajax.config.compose import compose, list_experiments
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.learning.agent import Agent
 from foajax.networks import network as networks
 from foajax.sensors.sense import pixel_count

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.shipped import agents
 from foajax.learning.programs import use_compilation_cache
 from foajax.player import write_page
 from foajax.render import make_directory, play, progress_bar
@@ -36,13 +37,6 @@ class Options:
     def __post_init__(self) -> None:
         if self.steps < 1:
             raise ConfigError(f"steps={self.steps}: accepted is an integer >= 1")
-
-
-def agents() -> Path:
-    """agents/: inside the package when installed from a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    inside = package / "agents"
-    return inside if inside.is_dir() else package.parent / "agents"
 
 
 def choose(directory: Path, game: str | None) -> Path:

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.envs.make import Environment, make
 from foajax.runs.agents import Stored, load_agent
 

@@ -21,7 +21,8 @@ import numpy as np
 from PIL import Image
 
 from foajax import cli
-from foajax.config.schema import ConfigError, LogPolarSensor
+from foajax.config.parse import ConfigError
+from foajax.config.schema import LogPolarSensor
 from foajax.envs.make import steps_per_second
 from foajax.learning.programs import use_compilation_cache
 from foajax.render import make_directory, play, progress_bar

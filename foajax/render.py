@@ -24,7 +24,7 @@ from PIL import Image
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.envs.make import steps_per_second
 from foajax.learning.programs import use_compilation_cache
 from foajax.runs.agents import Stored, load_agent

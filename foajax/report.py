@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from foajax import cli, cost
-from foajax.config.schema import ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, to_mapping
 from foajax.render import make_directory, play, progress_bar
 from foajax.reporting import curves
 from foajax.reporting.curves import RunData, read_run

@@ -24,7 +24,8 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.schema import Config, ConfigError, RingSensor, Sensor
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config, RingSensor, Sensor
 from foajax.envs import make as envs
 from foajax.sensors.frames import to_frame
 from foajax.sensors.sense import picture, pixel_count, sense

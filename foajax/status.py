@@ -26,7 +26,7 @@ from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.runs.status import RunStatus, find_runs, inspect
 
 _COLOURS = {"running": "green", "finished": "blue", "failed": "red", "stalled": "yellow"}

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.runs.agents import FACTS, Stored, load_agent, load_score, save_agent
 from foajax.runs.directory import PARAMETERS
 

@@ -5,22 +5,22 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import signal
 import sys
 import time
 import traceback
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import jax
 import numpy as np
 
-from foajax.config import compose
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.envs import make as envs
+from foajax.launch import launch
 from foajax.launch import processes as distributed
 from foajax.launch.processes import Job, Watch
+from foajax.launch.signals import StopRequest
 from foajax.learning.agent import Agent
 from foajax.learning.learner import Metrics
 from foajax.learning.programs import make_programs, make_state, use_compilation_cache
@@ -34,26 +34,12 @@ from foajax.training import profiling
 from foajax.training.collector import Collector, update_on
 from foajax.training.dump import Dump
 from foajax.training.episodes import EpisodeTracker
-from foajax.training.watchdog import FAULT, STOPS, EnvironmentFault, Watchdog, record
+from foajax.training.watchdog import FAULT, EnvironmentFault, Watchdog, record
 from foajax.types import Outcome, Rollout, TrainState
 from foajax.viewing.previews import snapshots
 
 _PICTURES_EVERY = 900.0  # seconds
 _GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best
-
-
-class StopRequest:
-    """Turns SIGINT, SIGTERM and SIGUSR1 (a cluster's preemption) into a flag; a second SIGINT interrupts at once."""
-
-    def __init__(self) -> None:
-        self.name: str | None = None
-        for number in STOPS:
-            signal.signal(number, self._note)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.name is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.name = signal.Signals(number).name
 
 
 class Run:
@@ -449,4 +435,4 @@ def _train(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(compose.run(train, sys.argv[1:], check=check))
+    sys.exit(launch.run(train, sys.argv[1:], check=check))

@@ -20,7 +20,7 @@ import yaml
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, to_mapping
 from foajax.report import games_of
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.runs.directory import FREE, load_config

@@ -22,7 +22,7 @@ import numpy as np
 import optax
 import pytest
 
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.runs import durable
 from foajax.runs.checkpoints import CheckpointError, Checkpoints
 

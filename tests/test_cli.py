@@ -9,7 +9,7 @@ import re
 import pytest
 
 from foajax import cli
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,9 +15,11 @@ import pytest
 import yaml
 
 from foajax import cli
-from foajax.config.compose import compose, list_experiments, run
-from foajax.config.schema import Config, ConfigError, HeadConfig, LogPolarSensor, RingSensor, to_mapping
+from foajax.config.compose import compose, list_experiments
+from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.schema import Config, HeadConfig, LogPolarSensor, RingSensor
 from foajax.launch import sweep
+from foajax.launch.launch import run
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foajax.config.schema import Config, ConfigError, GazeConfig, LogPolarSensor, RingSensor, from_mapping, to_mapping
+from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.schema import Config, GazeConfig, LogPolarSensor, RingSensor, from_mapping
 
 RINGS = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
 LOG_POLAR = Config(name="logpolar", sensor=LogPolarSensor(), gaze=GazeConfig(bounds="point"))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from foajax import cli, demo, evaluate, store
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.runs import agents
 
 EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}

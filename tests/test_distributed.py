@@ -17,7 +17,7 @@ import processes
 import pytest
 
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.launch import coordinator
 from foajax.launch import processes as distributed
 from foajax.runs.agents import load_agent

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from foajax.config.schema import Config, ConfigError, EnvConfig, RingSensor
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config, EnvConfig, RingSensor
 from foajax.envs import make as envs
 from foajax.envs import probes, tasks
 from foajax.envs.gymnasium import area_weights, gray_frames

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from foajax.config.schema import ConfigError, LogPolarSensor, RingSensor
+from foajax.config.parse import ConfigError
+from foajax.config.schema import LogPolarSensor, RingSensor
 from foajax.sensors.sense import PixelCount, image_shapes, picture, pixel_count, ring_boxes, sense
 
 DECREASING = ((30, 30, 1), (50, 50, 2), (70, 70, 4))

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax.config.schema import ConfigError, GazeConfig
+from foajax.config.parse import ConfigError
+from foajax.config.schema import GazeConfig
 from foajax.sensors import gaze
 
 FRAME = (80, 90)

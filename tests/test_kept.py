@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from foajax.config.compose import compose
-from foajax.config.schema import flatten, to_mapping
+from foajax.config.parse import flatten, to_mapping
 from foajax.runs.directory import FREE, load_config
 
 SCRIPT = Path(__file__).parents[1] / "results" / "keep.py"

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from processes import finish
 from test_config import LOG_POLAR, OUT_OF_RANGE, RINGS, SECTIONS, paths
 
-from foajax.config.compose import run
-from foajax.config.schema import to_mapping
+from foajax.config.parse import to_mapping
+from foajax.launch.launch import run
 
 KEYS = {".".join(path): [] for path in paths(to_mapping(RINGS))}
 KEYS |= {

@@ -9,7 +9,8 @@ import numpy as np
 import optax
 import pytest
 
-from foajax.config.schema import ConfigError, LearnerConfig
+from foajax.config.parse import ConfigError
+from foajax.config.schema import LearnerConfig
 from foajax.learning.optimizer import make_optimizer
 
 UPDATES = 200

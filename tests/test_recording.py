@@ -8,7 +8,7 @@ import pytest
 
 from foajax import evaluate
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.envs import make as envs
 from foajax.evaluate import play
 from foajax.learning.agent import Agent

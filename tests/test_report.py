@@ -14,7 +14,7 @@ from PIL import Image
 
 from foajax import cli, report
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError, to_mapping
+from foajax.config.parse import ConfigError, to_mapping
 from foajax.reporting import curves
 from foajax.viewing import heatmap
 from foajax.viewing.heatmap import HeatMap

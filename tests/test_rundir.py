@@ -18,7 +18,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foajax.config.schema import Config, ConfigError, LogPolarSensor, RingSensor, from_mapping, to_mapping
+from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.schema import Config, LogPolarSensor, RingSensor, from_mapping
 from foajax.runs import provenance
 from foajax.runs.directory import load_config, open_run
 from foajax.runs.lock import RunError

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from foajax import status as command
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.runs import status
 from foajax.runs.directory import open_run
 from foajax.runs.lock import is_held

@@ -13,7 +13,7 @@ import jax
 import pytest
 
 from foajax.config.compose import compose
-from foajax.config.schema import to_mapping
+from foajax.config.parse import to_mapping
 from foajax.launch import sweep
 from foajax.runs.agents import load_agent
 

@@ -14,7 +14,7 @@ import pytest
 from processes import TINY, finish, has_rows, rows, start, wait_for
 
 from foajax.config.compose import compose
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.launch.processes import Job
 from foajax.runs.agents import load_agent, save_agent
 from foajax.runs.checkpoints import Checkpoints

@@ -10,7 +10,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset
 
-from foajax.config.schema import ConfigError, GazeConfig, RingSensor
+from foajax.config.parse import ConfigError
+from foajax.config.schema import GazeConfig, RingSensor
 from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
 
 FULL = RingSensor(rings=((6, 6, 1),), layout="packed")

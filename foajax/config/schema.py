@@ -9,34 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import types
-import typing
-from collections.abc import Iterator, Mapping
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
-
-class ConfigError(ValueError):
-    """A configuration that cannot be run; the message is one line for the user."""
-
-
-def _check(ok: bool, key: str, value: object, accepted: str) -> None:
-    if not ok:
-        raise ConfigError(f"{key}={brief(value)}: accepted is {accepted}")
-
-
-def brief(value: object) -> str:
-    """A value in one line, of 80 characters at most."""
-    text = str(list(value)) if isinstance(value, tuple) else str(value)
-    text = " ".join(text.split())
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _check_types(config: Any, key: str) -> None:
-    """For what is also built in Python: the types that `build` checks of a mapping."""
-    hints = typing.get_type_hints(type(config))
-    for field in dataclasses.fields(config):
-        value = _convert(hints[field.name], getattr(config, field.name), f"{key}.{field.name}")
-        object.__setattr__(config, field.name, value)
+from foajax.config.parse import build, check, check_types
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,11 +26,11 @@ class RingSensor:
     pooling: Literal["mean", "stride"] = "mean"
 
     def __post_init__(self) -> None:
-        _check_types(self, "sensor")
-        _check(len(self.rings) > 0, "sensor.rings", self.rings, "at least one [height, width, factor]")
+        check_types(self, "sensor")
+        check(len(self.rings) > 0, "sensor.rings", self.rings, "at least one [height, width, factor]")
         for ring in self.rings:
             height, width, factor = ring
-            _check(
+            check(
                 1 <= factor <= min(height, width),
                 "sensor.rings",
                 ring,
@@ -62,9 +38,9 @@ class RingSensor:
             )
         for inner, outer in zip(self.rings, self.rings[1:], strict=False):
             nested = inner[0] <= outer[0] and inner[1] <= outer[1] and inner[:2] != outer[:2]
-            _check(nested, "sensor.rings", self.rings, "rings that nest, each larger than the one before")
+            check(nested, "sensor.rings", self.rings, "rings that nest, each larger than the one before")
         if self.peripheral is not None:
-            _check(min(self.peripheral) >= 1, "sensor.peripheral", self.peripheral, "null or [rows, columns] >= 1")
+            check(min(self.peripheral) >= 1, "sensor.peripheral", self.peripheral, "null or [rows, columns] >= 1")
 
     @property
     def window(self) -> tuple[int, int]:
@@ -84,12 +60,12 @@ class LogPolarSensor:
     sampling: Literal["area", "bilinear"] = "area"
 
     def __post_init__(self) -> None:
-        _check_types(self, "sensor")
-        _check(2 <= self.rings <= 1000, "sensor.rings", self.rings, "an integer from 2 to 1000")
-        _check(4 <= self.wedges <= 1000, "sensor.wedges", self.wedges, "an integer from 4 to 1000")
-        _check(self.fovea > 0, "sensor.fovea", self.fovea, "a radius > 0")
+        check_types(self, "sensor")
+        check(2 <= self.rings <= 1000, "sensor.rings", self.rings, "an integer from 2 to 1000")
+        check(4 <= self.wedges <= 1000, "sensor.wedges", self.wedges, "an integer from 4 to 1000")
+        check(self.fovea > 0, "sensor.fovea", self.fovea, "a radius > 0")
         radius = f"a radius > sensor.fovea={self.fovea} and <= 10000"
-        _check(self.fovea < self.radius <= 10_000, "sensor.radius", self.radius, radius)
+        check(self.fovea < self.radius <= 10_000, "sensor.radius", self.radius, radius)
 
     @property
     def window(self) -> tuple[int, int]:
@@ -113,10 +89,10 @@ class GazeConfig:
     path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn, moved within bounds
 
     def __post_init__(self) -> None:
-        _check_types(self, "gaze")
-        _check(1 <= self.step <= 10_000, "gaze.step", self.step, "an integer from 1 to 10000")
+        check_types(self, "gaze")
+        check(1 <= self.step <= 10_000, "gaze.step", self.step, "an integer from 1 to 10000")
         if self.mode == "scripted":
-            _check(len(self.path) > 0, "gaze.path", self.path, "at least one [y, x] where gaze.mode=scripted")
+            check(len(self.path) > 0, "gaze.path", self.path, "at least one [y, x] where gaze.mode=scripted")
 
     @property
     def learned(self) -> bool:
@@ -144,21 +120,21 @@ class EnvConfig:
     timeout: float = 120.0  # seconds that a step may take before the engine is taken for hung
 
     def __post_init__(self) -> None:
-        _check(1 <= self.num_envs <= 100_000, "env.num_envs", self.num_envs, "an integer from 1 to 100000")
-        _check(self.groups >= 1, "env.groups", self.groups, "an integer >= 1")
+        check(1 <= self.num_envs <= 100_000, "env.num_envs", self.num_envs, "an integer from 1 to 100000")
+        check(self.groups >= 1, "env.groups", self.groups, "an integer >= 1")
         fits = min(self.frame_shape) >= 8 and max(self.frame_shape) <= 10_000
-        _check(fits, "env.frame_shape", self.frame_shape, "[height, width], each from 8 to 10000")
-        _check("default" in self.crop_top, "env.crop_top", dict(self.crop_top), "a mapping with the key 'default'")
+        check(fits, "env.frame_shape", self.frame_shape, "[height, width], each from 8 to 10000")
+        check("default" in self.crop_top, "env.crop_top", dict(self.crop_top), "a mapping with the key 'default'")
         for game, row in self.crop_top.items():
-            _check(0 <= row <= 50, f"env.crop_top.{game}", row, "a screen row from 0 to 50 (160 rows are kept of 210)")
-        _check(1 <= self.frame_skip <= 1000, "env.frame_skip", self.frame_skip, "an integer from 1 to 1000")
-        _check(0 <= self.noop_max <= 200, "env.noop_max", self.noop_max, "an integer from 0 to 200")
-        _check(0 <= self.sticky_actions < 1, "env.sticky_actions", self.sticky_actions, "a probability in [0, 1)")
+            check(0 <= row <= 50, f"env.crop_top.{game}", row, "a screen row from 0 to 50 (160 rows are kept of 210)")
+        check(1 <= self.frame_skip <= 1000, "env.frame_skip", self.frame_skip, "an integer from 1 to 1000")
+        check(0 <= self.noop_max <= 200, "env.noop_max", self.noop_max, "an integer from 0 to 200")
+        check(0 <= self.sticky_actions < 1, "env.sticky_actions", self.sticky_actions, "a probability in [0, 1)")
         # The engines count frames in 32 bits, and abort the process where the system has no threads left.
         steps = "an integer from 1 to 2000000"
-        _check(1 <= self.max_episode_steps <= 2_000_000, "env.max_episode_steps", self.max_episode_steps, steps)
-        _check(0 <= self.threads <= 1024, "env.threads", self.threads, "an integer from 0 to 1024")
-        _check(self.timeout > 0, "env.timeout", self.timeout, "seconds > 0")
+        check(1 <= self.max_episode_steps <= 2_000_000, "env.max_episode_steps", self.max_episode_steps, steps)
+        check(0 <= self.threads <= 1024, "env.threads", self.threads, "an integer from 0 to 1024")
+        check(self.timeout > 0, "env.timeout", self.timeout, "seconds > 0")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,22 +150,23 @@ class NetworkConfig:
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 
     def __post_init__(self) -> None:
-        _check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
-        _check(1 <= self.lstm <= 16_384, "network.lstm", self.lstm, "an integer from 1 to 16384")
+        check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
+        check(1 <= self.lstm <= 16_384, "network.lstm", self.lstm, "an integer from 1 to 16384")
 
 
 @dataclasses.dataclass(frozen=True)
 class HeadConfig:
     """What one head learns with."""
 
+    relative_keys: ClassVar[bool] = True  # a head does not know whose it is; the rest name their keys in full
     gamma: float = 0.99
     gae_lambda: float = 0.95
     beta: float = 0.003  # weight of the entropy
 
     def __post_init__(self) -> None:
-        _check(0 <= self.gamma <= 1, "gamma", self.gamma, "a number in [0, 1]")
-        _check(0 <= self.gae_lambda <= 1, "gae_lambda", self.gae_lambda, "a number in [0, 1]")
-        _check(self.beta >= 0, "beta", self.beta, "a number >= 0")
+        check(0 <= self.gamma <= 1, "gamma", self.gamma, "a number in [0, 1]")
+        check(0 <= self.gae_lambda <= 1, "gae_lambda", self.gae_lambda, "a number in [0, 1]")
+        check(self.beta >= 0, "beta", self.beta, "a number >= 0")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,22 +200,22 @@ class LearnerConfig:
         ranges["warmup_updates"] = (0, 10**9)
         for key, (least, most) in ranges.items():
             value = getattr(self, key)
-            _check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
+            check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
         inputs = self.full_rate_inputs
         accepted = f"null or an integer from 1 to {10**9}"
-        _check(inputs is None or 1 <= inputs <= 10**9, "learner.full_rate_inputs", inputs, accepted)
+        check(inputs is None or 1 <= inputs <= 10**9, "learner.full_rate_inputs", inputs, accepted)
         for key in ("learning_rate", "adam_eps"):
-            _check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
+            check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
         for key in ("adam_b1", "adam_b2"):
-            _check(0 <= getattr(self, key) < 1, f"learner.{key}", getattr(self, key), "a number in [0, 1)")
+            check(0 <= getattr(self, key) < 1, f"learner.{key}", getattr(self, key), "a number in [0, 1)")
         for key in ("clip_ratio", "max_grad_norm"):
             value = getattr(self, key)
-            _check(value is None or value > 0, f"learner.{key}", value, "null or a number > 0")
+            check(value is None or value > 0, f"learner.{key}", value, "null or a number > 0")
         for key in ("value_weight", "vision_weight"):
-            _check(getattr(self, key) >= 0, f"learner.{key}", getattr(self, key), "a number >= 0")
+            check(getattr(self, key) >= 0, f"learner.{key}", getattr(self, key), "a number >= 0")
         applies = self.vision_bootstrap == "consistent" or self.value_target == "n_step"
         accepted = f"consistent where learner.value_target={self.value_target}"
-        _check(applies, "learner.vision_bootstrap", self.vision_bootstrap, accepted)
+        check(applies, "learner.vision_bootstrap", self.vision_bootstrap, accepted)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,11 +232,11 @@ class TrainConfig:
     dump_skipped: bool = False  # keep the batches that such rows begin with, in <run>/skipped
 
     def __post_init__(self) -> None:
-        _check(self.env_steps >= 1, "train.env_steps", self.env_steps, "an integer >= 1")
+        check(self.env_steps >= 1, "train.env_steps", self.env_steps, "an integer >= 1")
         for key in ("log_every", "checkpoint_every"):
-            _check(getattr(self, key) > 0, f"train.{key}", getattr(self, key), "seconds > 0")
+            check(getattr(self, key) > 0, f"train.{key}", getattr(self, key), "seconds > 0")
         for key in ("keep", "devices", "max_skipped"):
-            _check(1 <= getattr(self, key) <= 10**9, f"train.{key}", getattr(self, key), "an integer from 1 to 10^9")
+            check(1 <= getattr(self, key) <= 10**9, f"train.{key}", getattr(self, key), "an integer from 1 to 10^9")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,7 +250,7 @@ class DistributedConfig:
 
     def __post_init__(self) -> None:
         stated = [value is not None for value in (self.coordinator, self.processes, self.process)]
-        _check(
+        check(
             all(stated) or not any(stated),
             "distributed.coordinator, distributed.processes, distributed.process",
             (self.coordinator, self.processes, self.process),
@@ -281,10 +258,10 @@ class DistributedConfig:
         )
         if self.coordinator is not None and self.processes is not None and self.process is not None:
             check_address("distributed.coordinator", self.coordinator)
-            _check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
+            check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
             accepted = f"an integer from 0 to {self.processes - 1}"
-            _check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)
-        _check(self.timeout > 0, "distributed.timeout", self.timeout, "seconds > 0")
+            check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)
+        check(self.timeout > 0, "distributed.timeout", self.timeout, "seconds > 0")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,13 +282,13 @@ class Config:
     distributed: DistributedConfig = DistributedConfig()
 
     def __post_init__(self) -> None:
-        _check(self.name.strip() != "", "name", repr(self.name), "the name of an experiment")
-        _check(self.game.strip() != "", "game", repr(self.game), "the name of a game")
-        _check(0 <= self.seed < 2**31 - 10_000, "seed", self.seed, "an integer from 0 to 2147473647")
+        check(self.name.strip() != "", "name", repr(self.name), "the name of an experiment")
+        check(self.game.strip() != "", "game", repr(self.game), "the name of a game")
+        check(0 <= self.seed < 2**31 - 10_000, "seed", self.seed, "an integer from 0 to 2147473647")
         height, width = self.env.frame_shape
         if self.gaze.bounds == "window" or isinstance(self.sensor, RingSensor):
             fits = self.sensor.window[0] <= height and self.sensor.window[1] <= width
-            _check(
+            check(
                 fits,
                 "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius",
                 self.sensor.window,
@@ -319,7 +296,7 @@ class Config:
             )
         if isinstance(self.sensor, RingSensor) and self.sensor.peripheral is not None:
             rows, columns = self.sensor.peripheral
-            _check(
+            check(
                 rows <= height and columns <= width,
                 "sensor.peripheral",
                 self.sensor.peripheral,
@@ -328,23 +305,23 @@ class Config:
         if self.gaze.mode in ("learned", "random") and self.gaze.bounds == "window":
             key = "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius"
             accepted = f"point, or gaze=none: {key} fills env.frame_shape={height}x{width} and could not move"
-            _check(self.sensor.window != (height, width), "gaze.bounds", self.gaze.bounds, accepted)
+            check(self.sensor.window != (height, width), "gaze.bounds", self.gaze.bounds, accepted)
         points = self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ())
         for point in points:
-            _check(
+            check(
                 0 <= point[0] < height and 0 <= point[1] < width,
                 "gaze.start or gaze.path",
                 point,
                 f"[y, x] inside env.frame_shape={height}x{width}",
             )
-        _check(
+        check(
             self.env.num_envs % self.learner.minibatches == 0,
             "learner.minibatches",
             self.learner.minibatches,
             f"a divisor of env.num_envs={self.env.num_envs}",
         )
         check_shares(self, self.train.devices, "train.devices", self.train.devices)
-        _check(
+        check(
             self.learner.minibatches % self.env.groups == 0,
             "env.groups",
             self.env.groups,
@@ -355,7 +332,7 @@ class Config:
         most = 2**31 // max(self.learner.rollout_length, self.learner.minibatches * self.learner.epochs) - 2
         steps = most * self.env.num_envs * self.learner.rollout_length
         accepted = f"at most {steps} with these learner.rollout_length, minibatches, epochs and env.num_envs"
-        _check(rollouts <= most, "train.env_steps", self.train.env_steps, accepted)
+        check(rollouts <= most, "train.env_steps", self.train.env_steps, accepted)
 
     @property
     def run_dir(self) -> str:
@@ -367,132 +344,16 @@ class Config:
 def check_address(key: str, value: str) -> None:
     """`ConfigError`, about `key`, unless `value` says where other processes find the first one."""
     host, _, port = value.rpartition(":")
-    _check(host != "" and port.isdecimal(), key, value, "host:port of process 0")
+    check(host != "" and port.isdecimal(), key, value, "host:port of process 0")
 
 
 def check_shares(config: Config, shares: int, key: str, value: object) -> None:
     """`ConfigError`, about `key`, unless `shares` devices can each have the same part of a minibatch."""
     size = config.env.num_envs // config.learner.minibatches
     accepted = f"a divisor of the {size} environments of a minibatch (env.num_envs / learner.minibatches)"
-    _check(size % shares == 0, key, value, accepted)
+    check(size % shares == 0, key, value, accepted)
 
 
 def from_mapping(mapping: Mapping[str, Any]) -> Config:
     """Builds a checked `Config` from plain nested mappings; raises `ConfigError`."""
     return build(Config, mapping, "")
-
-
-def to_mapping(config: Any) -> dict[str, Any]:
-    """The inverse of `from_mapping`: plain dicts, lists and scalars."""
-
-    def plain(value: Any) -> Any:
-        if dataclasses.is_dataclass(value):
-            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        if isinstance(value, Mapping):
-            return {k: plain(v) for k, v in value.items()}
-        return [plain(v) for v in value] if isinstance(value, tuple) else value
-
-    return plain(config)
-
-
-def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and their values."""
-    for key, value in mapping.items():
-        if isinstance(value, Mapping):
-            yield from flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def build(cls: Any, value: Any, key: str) -> Any:
-    """A dataclass from a mapping, every field converted to its annotated type."""
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{key or 'config'}={brief(value)}: accepted is a mapping")
-    hints = typing.get_type_hints(cls)
-    names = [f.name for f in dataclasses.fields(cls)]
-    prefix = f"{key}." if key else ""
-    for name in value:
-        if name not in names:
-            raise ConfigError(
-                f"{prefix}{brief(name)}={brief(value[name])}: unknown key; accepted are {', '.join(names)}"
-            )
-    for field in dataclasses.fields(cls):
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and field.name not in value:
-            raise ConfigError(f"{prefix}{field.name}: missing; accepted is {describe(hints[field.name])}")
-    kwargs = {name: _convert(hints[name], v, f"{prefix}{name}") for name, v in value.items()}
-    try:
-        return cls(**kwargs)
-    except ConfigError as error:
-        # A head does not know whose it is; the rest name their keys in full.
-        raise ConfigError(f"{prefix}{error}" if cls is HeadConfig else str(error)) from None
-
-
-def _convert(hint: Any, value: Any, key: str) -> Any:
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if hint == Sensor:
-        kind = value.get("kind", "rings") if isinstance(value, Mapping) else None
-        kinds = {"rings": RingSensor, "logpolar": LogPolarSensor}
-        if isinstance(value, Mapping) and not (isinstance(kind, str) and kind in kinds):
-            raise ConfigError(f"{key}.kind={brief(kind)}: accepted is one of {', '.join(kinds)}")
-        return build(kinds.get(str(kind), RingSensor), value, key)
-    if origin in (typing.Union, types.UnionType):
-        for option in args:
-            try:
-                return _convert(option, value, key)
-            except ConfigError:
-                continue
-        raise ConfigError(f"{key}={brief(value)}: accepted is {describe(hint)}")
-    if dataclasses.is_dataclass(hint):
-        return build(hint, value, key)
-    accepted = ConfigError(f"{key}={brief(value)}: accepted is {describe(hint)}")
-    if origin is Literal:
-        for option in args:
-            if type(option) is type(value) and option == value:
-                return value
-        raise accepted
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise accepted
-        if args[-1] is Ellipsis:
-            return tuple(_convert(args[0], v, key) for v in value)
-        if len(value) != len(args):
-            raise accepted
-        return tuple(_convert(a, v, key) for a, v in zip(args, value, strict=True))
-    if origin is not None and issubclass(origin, Mapping):
-        if not isinstance(value, Mapping) or not all(isinstance(k, args[0]) for k in value):
-            raise accepted
-        return {k: _convert(args[1], v, f"{key}.{k}") for k, v in value.items()}
-    if hint is type(None):
-        if value is None:
-            return None
-    elif hint is float:
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if is_number and (value == 0 or 1e-37 <= abs(value) <= 1e38):  # others would be 0 or infinite in float32
-            return float(value)
-    elif type(value) is hint:
-        return value
-    raise accepted
-
-
-def describe(hint: Any) -> str:
-    """What a type accepts, in words."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        return "one of " + ", ".join(str(a) for a in args)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(describe(a) for a in args)
-    if origin is tuple:
-        if args[-1] is Ellipsis:
-            return f"a list of {describe(args[0])}"
-        return "[" + ", ".join(describe(a) for a in args) + "]"
-    if origin is not None:
-        return f"a mapping to {describe(args[1])}"
-    plain = {
-        int: "an integer",
-        float: "a number (0, or of 1e-37 to 1e38)",
-        bool: "true or false",
-        str: "a string",
-        type(None): "null",
-    }
-    return plain.get(hint, "a mapping")

@@ -14,7 +14,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from foajax.config.schema import Config, ConfigError, brief
+from foajax.config.parse import ConfigError, brief
+from foajax.config.schema import Config
 from foajax.types import Outcome, TimeStep
 
 LUMA = np.array([299, 587, 114])  # thousandths of red, green and blue in gray (ITU-R BT.601)

@@ -22,7 +22,8 @@ from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.envs import probes, seek
 from foajax.envs.gymnasium import GymnasiumEnvironment
 from foajax.envs.tasks import JaxEnvironment, Task

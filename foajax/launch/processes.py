@@ -30,7 +30,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxlib import _jax
 
-from foajax.config.schema import Config, ConfigError, check_address, check_shares, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.schema import Config, check_address, check_shares
 from foajax.launch import coordinator
 
 T = TypeVar("T")

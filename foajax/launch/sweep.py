@@ -7,21 +7,26 @@ nevertheless. A signal goes on to the running processes, which save; no further 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import itertools
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
+from foajax.config.compose import choices, compose, parse_override
+from foajax.config.parse import ConfigError, one_line
 from foajax.config.schema import Config
+from foajax.launch.signals import STOPS
 from foajax.runs.directory import failure, forget_failure
 from foajax.runs.status import is_finished
-from foajax.training.watchdog import STOPS
 
 _POLL = 0.1  # seconds between two looks at the running processes
 _OUTPUT = "output.txt"  # of a run beside others, in its directory
@@ -168,3 +173,46 @@ def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
+
+
+def expand(words: Sequence[str]) -> list[Run]:
+    """Every run of a sweep, checked, so that a mistake in the last one does not show hours later."""
+    swept = {parse_override(word).key_or_group for word in words if parse_override(word).is_sweep_override()}
+    runs: dict[str, Run] = {}
+    for overrides in itertools.product(*map(_values, words)):
+        plain = compose(overrides)
+        config = named(plain, overrides, swept)
+        if config.run_dir in runs:
+            accepted = "a directory for each, as with 'name=constant70-${gaze.mode}'"
+            raise ConfigError(f"run={config.run_dir}: two runs would share it; accepted is {accepted}")
+        name = [] if config == plain else [f"name='{config.name}'"]
+        runs[config.run_dir] = Run((*overrides, *name), config)
+    return list(runs.values())
+
+
+def named(config: Config, overrides: Iterable[str], swept: set[str]) -> Config:
+    """`config` with a name that tells what the sweep chose, unless the choices name the directory already."""
+    known = {"experiment", "game", "seed", "name", "run"}
+    parsed = {override.key_or_group: override for override in map(parse_override, overrides)}
+    if {"name", "run"} & parsed.keys():
+        return config
+    chosen = [f"{key}={parsed[key].get_value_string()}" for key in parsed if key in swept - known]
+    return dataclasses.replace(config, name="-".join([config.name, *(re.sub(r"[^\w.=+-]+", "-", c) for c in chosen)]))
+
+
+def _values(word: str) -> Iterable[str]:
+    """The single overrides that one override of a sweep stands for."""
+    from hydra.core.override_parser.types import Glob
+
+    override = parse_override(word)
+    key, value = override.key_or_group, override.value()
+    if not override.is_sweep_override():
+        return [word]
+    if isinstance(value, Glob):
+        names = choices().get(key, ())
+        if not (chosen := value.filter(list(names))):
+            raise ConfigError(f"{one_line(word)}: accepted is what matches one of {', '.join(names) or 'no names'}")
+        return [f"{key}={choice}" for choice in chosen]
+    if not override.is_discrete_sweep():
+        raise ConfigError(f"{one_line(word)}: accepted is a list of values")
+    return [f"{key}={choice}" for choice in override.sweep_string_iterator()]

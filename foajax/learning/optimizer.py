@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from foajax.config.schema import ConfigError, LearnerConfig
+from foajax.config.parse import ConfigError
+from foajax.config.schema import LearnerConfig
 from foajax.types import Params
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.reporting.scores import CONFIDENCE, RESAMPLES, Interval
 from foajax.runs.directory import load_config
 from foajax.runs.rows import parse_row

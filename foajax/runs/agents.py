@@ -18,7 +18,8 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from foajax.config.schema import Config, ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.schema import Config
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_state
 from foajax.runs import durable

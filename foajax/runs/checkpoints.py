@@ -34,7 +34,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint._src.multihost import multihost
 
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.runs import durable
 
 _FORMAT = 1

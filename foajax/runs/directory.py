@@ -20,7 +20,8 @@ from typing import Any
 
 import yaml
 
-from foajax.config.schema import Config, ConfigError, flatten, from_mapping, to_mapping
+from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.schema import Config, from_mapping
 from foajax.runs import durable
 from foajax.runs.lock import RunError, reason_of, take_lock
 from foajax.runs.provenance import RECORD, record_start

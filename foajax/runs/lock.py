@@ -8,7 +8,7 @@ import socket
 import time
 from pathlib import Path
 
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
 
 
 class RunError(ConfigError):

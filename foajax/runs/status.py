@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.runs.directory import check_same_run, describe_error, failure, is_run, load_config
 from foajax.runs.lock import is_held
 from foajax.runs.rows import last_rows, speed_of

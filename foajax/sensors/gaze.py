@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from foajax.config.schema import ConfigError, GazeConfig
+from foajax.config.parse import ConfigError
+from foajax.config.schema import GazeConfig
 
 Shape = tuple[int, int]  # rows, columns
 

@@ -23,7 +23,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.config.schema import ConfigError, LogPolarSensor, RingSensor, Sensor
+from foajax.config.parse import ConfigError
+from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
 from foajax.sensors import logpolar
 from foajax.types import HostArray
 

@@ -25,7 +25,8 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float, Int, Num, UInt32
 
 from foajax.config.compose import compose
-from foajax.config.schema import Config, ConfigError, EnvConfig, GazeConfig, Sensor, brief
+from foajax.config.parse import ConfigError, brief
+from foajax.config.schema import Config, EnvConfig, GazeConfig, Sensor
 from foajax.sensors import gaze as gazes
 from foajax.sensors.sense import image_shapes, sense
 

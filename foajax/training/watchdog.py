@@ -25,10 +25,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from foajax.config.schema import ConfigError
+from foajax.config.parse import ConfigError
+from foajax.launch.signals import signal_in
 
 FAULT = 3  # exit code: an environment raised or hung; the same command goes on
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)  # the last one is a cluster's preemption
 GRACE = 5.0  # seconds that the main thread has to answer one of them, of the 10 that a cluster may leave
 _TICK = 0.5  # seconds between two looks
 _METHODS = ("reset", "send", "recv", "close")  # of an environment: what may raise or hang
@@ -125,7 +125,7 @@ class Watchdog:
         since_asked = 0.0
         while not self._closed:
             if select.select([self._hear], [], [], _TICK)[0]:
-                asked = asked or _signal_in(os.read(self._hear, 64))
+                asked = asked or signal_in(os.read(self._hear, 64))
             before, now = now, time.monotonic()
             passed = min(now - before, 2 * _TICK)  # after a pause of the process itself one look counts, no more
             call = self._call
@@ -160,9 +160,3 @@ def record(run_dir: Path, error: BaseException | None) -> Path:
         else:
             traceback.print_exception(error, file=file)
     return path
-
-
-def _signal_in(numbers: bytes) -> str:
-    """The first request to stop among the numbers of signals, if any."""
-    names = [signal.Signals(number).name for number in numbers if number in STOPS]
-    return names[0] if names else ""

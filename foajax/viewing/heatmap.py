@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from foajax.config.schema import Config, ConfigError
+from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.runs import durable
 from foajax.sensors.gaze import limits
 from foajax.viewing.recording import Recording
