@@ -39,7 +39,7 @@ from typing import IO, Any, Literal
 from foajax import cli
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
-from foajax.envs import make as envs
+from foajax.envs.make import make
 
 SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32
 DEVICES = (2, 4, 8)
@@ -146,7 +146,7 @@ def weak(options: Options, cores: Sequence[int]) -> dict[str, Any]:
     """Speeds of one process, of two that share a run, and of two runs at a time."""
     # What training would refuse is said once, and here.
     config = compose(training(options, Path("run"), 1, 0, ""))
-    envs.make(config, num_envs=1, seed=0).close()
+    make(config, num_envs=1, seed=0).close()
     with tempfile.TemporaryDirectory() as temporary:
         directory = Path(temporary)
 

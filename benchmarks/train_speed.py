@@ -35,10 +35,10 @@ from foajax import cli
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config
+from foajax.envs.make import make_environments
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_programs, make_state, use_compilation_cache
 from foajax.runtime import keep_memory
-from foajax.train import make_environments
 from foajax.training.collector import Collector, update_on
 
 PARTS = ("env_only", "act_only", "update_only", "end_to_end")

@@ -16,7 +16,8 @@ from rich.text import Text
 
 from foajax import cli
 from foajax.config.parse import ConfigError
-from foajax.envs.make import Environment, make
+from foajax.envs.base import Environment
+from foajax.envs.make import make
 from foajax.runs.agents import Stored, load_agent
 
 _FIRST_SEED = 1_000_003  # apart from the seeds of training

@@ -26,9 +26,10 @@ from foajax import cli
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config, RingSensor, Sensor
-from foajax.envs import make as envs
+from foajax.envs.make import make
 from foajax.sensors.frames import to_frame
-from foajax.sensors.sense import picture, pixel_count, sense
+from foajax.sensors.reconstruct import picture
+from foajax.sensors.sense import pixel_count, sense
 from foajax.viewing.style import draw_gaze
 
 PAPER = (
@@ -193,7 +194,7 @@ def _stack(images: Sequence[Image.Image]) -> Image.Image:
 
 def play(config: Config, steps: int) -> np.ndarray:
     """The frame after `steps` random actions, float32 [H, W] in [0, 1]."""
-    environment = envs.make(config, num_envs=1, seed=config.seed)
+    environment = make(config, num_envs=1, seed=config.seed)
     try:
         timestep, _ = environment.reset()
         random = np.random.default_rng(config.seed)

@@ -16,7 +16,9 @@ import numpy as np
 
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config
-from foajax.envs import make as envs
+from foajax.envs.atari import check_game, is_atari
+from foajax.envs.base import Environment
+from foajax.envs.make import make_environments
 from foajax.launch import launch
 from foajax.launch import processes as distributed
 from foajax.launch.processes import Job, Watch
@@ -88,21 +90,21 @@ class Run:
                 run_dir.path,
                 total_env_steps=config.train.env_steps,
                 start_env_steps=self._env_steps,
-                frame_skip=config.env.frame_skip if envs.is_atari(config) else 1,
+                frame_skip=config.env.frame_skip if is_atari(config) else 1,
             )
         )
         resources.enter_context(self._checkpoints)
         self._say = self._logger.message
         self._say(f"{run_dir.path}: {self._how_it_starts()}")
 
-    def _make_environments(self, resources: contextlib.ExitStack) -> list[envs.Environment]:
+    def _make_environments(self, resources: contextlib.ExitStack) -> list[Environment]:
         """This process's, watched. Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it
         got."""
         alone = self._job.count == 1
         watchdog = Watchdog(self._config.env.timeout, abandon=self._abandon, is_saved=self._is_saved, alone=alone)
         resources.enter_context(watchdog)
         make = watchdog.watched("making the environments", make_environments, patience=10.0)  # emulators load slowly
-        environments = make(self._config, self._env_steps, self._job)
+        environments = make(self._config, self._env_steps, self._job.index, self._job.count)
         for group, environment in enumerate(environments):
             watchdog.watch(environment, f"environment group {group}")
             resources.callback(environment.close)
@@ -342,20 +344,6 @@ def finite_mean(values: list[np.ndarray]) -> float:
     return float(np.mean(finite)) if finite else math.nan
 
 
-def environment_seed(seed: int, env_steps: int, group: int) -> int:
-    """Apart for every run, group and start: an engine adds its environments' numbers to one seed."""
-    return int(np.random.SeedSequence([seed, env_steps, group]).generate_state(1)[0] >> 2)
-
-
-def make_environments(config: Config, env_steps: int, job: Job | None = None) -> list[envs.Environment]:
-    """The groups of environments of a run that starts at `env_steps`, or a process's part of each group."""
-    index, count = (job.index, job.count) if job is not None else (0, 1)
-    batch = config.env.num_envs // config.env.groups // count
-    # An engine adds an environment's number to its seed: each is seeded alike whatever the number of processes.
-    seeds = [environment_seed(config.seed, env_steps, group) + index * batch for group in range(config.env.groups)]
-    return [envs.make(config, num_envs=batch, seed=seed) for seed in seeds]
-
-
 def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:
     """One line on stderr about an environment that raised or hung; returns the exit code."""
     run_dir = Path(config.run_dir)
@@ -400,7 +388,7 @@ def check(config: Config) -> None:
     if config.gaze.mode == "none" and window != frame:
         sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
         raise ConfigError(f"gaze.mode=none: accepted is a focal area {sizes}; or learned, frozen, random, scripted")
-    envs.check_game(config)
+    check_game(config)
     if config.train.init_from is not None and not is_run(Path(config.run_dir)):  # one that goes on does not need it
         check_source(config.train.init_from)
 

@@ -12,9 +12,9 @@ _PLAY = """
 import sys
 import numpy as np
 from foajax.config import compose
-from foajax.envs import make as envs
+from foajax.envs.make import make
 config = compose.compose(sys.argv[1:])
-environment = envs.make(config, num_envs=2, seed=config.seed)
+environment = make(config, num_envs=2, seed=config.seed)
 environment.reset()
 for _ in range(5):
     environment.send(np.zeros(2, np.int32))

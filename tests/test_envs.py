@@ -1,4 +1,4 @@
-"""foajax.envs.make, with the environments behind it, on really running games."""
+"""foajax.envs, with the engines behind it, on really running games."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from gymnasium import spaces
 
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config, EnvConfig, RingSensor
-from foajax.envs import make as envs
 from foajax.envs import probes, tasks
+from foajax.envs.atari import atari_name, envpool_id
 from foajax.envs.gymnasium import area_weights, gray_frames
+from foajax.envs.make import make
 
 ENGINES = ["envpool", "ale"]
 NOOP, FIRE, RIGHT, LEFT = range(4)  # Breakout's actions
@@ -49,7 +50,7 @@ def random_actions(steps: int, num_envs: int, num_actions: int) -> np.ndarray:
 @pytest.fixture(scope="module", params=ENGINES)
 def breakout(request) -> SimpleNamespace:
     """200 random steps of 3 games of Breakout; FIRE, which serves, is left to the engine."""
-    environment = envs.make(config(engine=request.param), num_envs=3, seed=0)
+    environment = make(config(engine=request.param), num_envs=3, seed=0)
     assert (environment.num_envs, environment.num_actions) == (3, 4)
     assert environment.crop_top == 34
     return play(environment, np.array([NOOP, RIGHT, LEFT])[random_actions(200, 3, 3)])
@@ -92,17 +93,17 @@ def test_the_last_frame_shows_the_end_and_the_first_a_new_game(breakout):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_fire_on_reset_serves_after_every_lost_life(engine):
     """Who does nothing loses a life each 24 or 25 steps, and never where nobody serves."""
-    run = play(envs.make(config(engine=engine, noop_max=0), num_envs=1, seed=0), noops(130))
+    run = play(make(config(engine=engine, noop_max=0), num_envs=1, seed=0), noops(130))
     np.testing.assert_array_equal(np.flatnonzero(run.is_terminal), [24, 49, 74, 99, 124])
     np.testing.assert_array_equal(np.flatnonzero(run.is_over), [124])
-    unserved = envs.make(config(engine=engine, noop_max=0, fire_on_reset=False), num_envs=1, seed=0)
+    unserved = make(config(engine=engine, noop_max=0, fire_on_reset=False), num_envs=1, seed=0)
     run = play(unserved, noops(60))
     assert not np.any(run.is_terminal)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_without_episodic_life_an_episode_is_a_game(engine):
-    environment = envs.make(config(engine=engine, episodic_life=False, noop_max=0), num_envs=2, seed=0)
+    environment = make(config(engine=engine, episodic_life=False, noop_max=0), num_envs=2, seed=0)
     actions = np.random.default_rng(1).integers(0, 4, (220, 2))
     run = play(environment, actions)
     assert run.is_over.sum() >= 2
@@ -113,7 +114,7 @@ def test_without_episodic_life_an_episode_is_a_game(engine):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_step_limit_ends_the_game_without_a_terminal(engine):
     """EnvPool does not count the step that begins the next episode of a game, ale-py does."""
-    environment = envs.make(config(engine=engine, noop_max=0, max_episode_steps=30), num_envs=1, seed=0)
+    environment = make(config(engine=engine, noop_max=0, max_episode_steps=30), num_envs=1, seed=0)
     run = play(environment, noops(80))
     last = 31 if engine == "envpool" else 30
     assert np.flatnonzero(run.is_over)[0] == last
@@ -125,7 +126,7 @@ def test_the_step_limit_ends_the_game_without_a_terminal(engine):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_life_lost_at_the_step_limit_is_a_terminal(engine):
     limit = 48 if engine == "envpool" else 49
-    environment = envs.make(config(engine=engine, noop_max=0, max_episode_steps=limit), num_envs=1, seed=0)
+    environment = make(config(engine=engine, noop_max=0, max_episode_steps=limit), num_envs=1, seed=0)
     run = play(environment, noops(60))
     np.testing.assert_array_equal(np.flatnonzero(run.is_terminal), [24, 49])
     np.testing.assert_array_equal(np.flatnonzero(run.is_over), [49])
@@ -134,7 +135,7 @@ def test_a_life_lost_at_the_step_limit_is_a_terminal(engine):
 
 @pytest.mark.parametrize(("engine", "clip"), [("envpool", True), ("ale", True), ("ale", False)])
 def test_rewards_are_clipped_and_scores_are_not(engine, clip):
-    environment = envs.make(config("space_invaders", engine=engine, clip_rewards=clip), num_envs=2, seed=0)
+    environment = make(config("space_invaders", engine=engine, clip_rewards=clip), num_envs=2, seed=0)
     run = play(environment, random_actions(60, 2, environment.num_actions))
     assert run.score.max() > 1
     np.testing.assert_array_equal(run.reward, np.sign(run.score) if clip else run.score)
@@ -144,9 +145,9 @@ def test_rewards_are_clipped_and_scores_are_not(engine, clip):
 def test_a_batch_is_its_environments_one_by_one(engine):
     """Environment i is seeded with seed + i, takes action i and gives row i, whatever the threads do."""
     actions = random_actions(40, 3, 4)
-    batch = play(envs.make(config(engine=engine, threads=2), num_envs=3, seed=7), actions)
+    batch = play(make(config(engine=engine, threads=2), num_envs=3, seed=7), actions)
     for i in (0, 2):
-        alone = play(envs.make(config(engine=engine), num_envs=1, seed=7 + i), actions[:, i : i + 1])
+        alone = play(make(config(engine=engine), num_envs=1, seed=7 + i), actions[:, i : i + 1])
         for name, values in vars(alone).items():
             np.testing.assert_array_equal(getattr(batch, name)[:, i], values[:, 0])
     assert np.any(batch.frame[0, 0] != batch.frame[0, 1])  # another number of no-ops
@@ -154,7 +155,7 @@ def test_a_batch_is_its_environments_one_by_one(engine):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_frames_handed_out_stay_as_they_are(engine):
-    environment = envs.make(config(engine=engine), num_envs=2, seed=0)
+    environment = make(config(engine=engine), num_envs=2, seed=0)
     timestep, _ = environment.reset()
     handed_out, copies = [timestep.frame], [timestep.frame.copy()]
     for _ in range(40):
@@ -171,14 +172,13 @@ def test_frames_handed_out_stay_as_they_are(engine):
 def test_sticky_actions_repeat_the_last_action():
     actions = np.tile([[LEFT], [RIGHT]], (20, 1))
     exact, sticky = (
-        play(envs.make(config(noop_max=0, sticky_actions=p), num_envs=1, seed=0), actions).frame[:24]
-        for p in (0.0, 0.9)
+        play(make(config(noop_max=0, sticky_actions=p), num_envs=1, seed=0), actions).frame[:24] for p in (0.0, 0.9)
     )
     assert np.any(exact != sticky)
 
 
 def test_a_game_that_ends_in_the_no_ops_is_over_with_the_next_first_step():
-    environment = envs.make(config(), num_envs=2, seed=0)
+    environment = make(config(), num_envs=2, seed=0)
     environment.reset()
 
     def answer(lives, terminated):
@@ -194,7 +194,7 @@ def test_a_game_that_ends_in_the_no_ops_is_over_with_the_next_first_step():
 
 
 def test_rendering_gives_the_colour_screens():
-    environment = envs.make(config(), num_envs=2, seed=0, render=True)
+    environment = make(config(), num_envs=2, seed=0, render=True)
     timestep, _ = environment.reset()
     screen = environment.render()
     assert screen.shape == (2, 210, 160, 3) and screen.dtype == np.uint8
@@ -206,9 +206,9 @@ def test_rendering_gives_the_colour_screens():
 def test_games_go_by_either_name():
     known = ["beam_rider", "pong", "up_n_down"]
     for game in ("beam_rider", "BeamRider-v5"):
-        assert envs.atari_name(game, known) == "beam_rider"
-    assert envs.envpool_id("up_n_down") == "UpNDown-v5"
-    environment = envs.make(config("BeamRider-v5"), num_envs=1, seed=0)
+        assert atari_name(game, known) == "beam_rider"
+    assert envpool_id("up_n_down") == "UpNDown-v5"
+    environment = make(config("BeamRider-v5"), num_envs=1, seed=0)
     assert (environment.num_actions, environment.crop_top) == (9, 20)
     environment.close()
 
@@ -231,12 +231,12 @@ def test_bad_input_is_one_clear_line(game, env, message, monkeypatch):
     sized = gymnasium.envs.registration.EnvSpec("Sized-v0", entry_point=Strict)  # without the shape that it needs
     monkeypatch.setitem(gymnasium.registry, "Sized-v0", sized)
     with pytest.raises(ConfigError, match=f"^{message}[^\n]*$"):
-        envs.make(config(game, **env), num_envs=1, seed=0)
+        make(config(game, **env), num_envs=1, seed=0)
 
 
 def test_ale_does_not_render():
     with pytest.raises(ConfigError, match="env.engine=ale: accepted is envpool"):
-        envs.make(config(engine="ale"), num_envs=1, seed=0, render=True)
+        make(config(engine="ale"), num_envs=1, seed=0, render=True)
 
 
 # --- pure JAX ---------------------------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_ale_does_not_render():
 
 def play_probe(name: str, policy, steps: int = 32, num_envs: int = 16) -> SimpleNamespace:
     """`play` with a policy that reads the state."""
-    environment = envs.make(config(f"probe:{name}"), num_envs=num_envs, seed=0)
+    environment = make(config(f"probe:{name}"), num_envs=num_envs, seed=0)
     steps_seen = [environment.reset()]
     states = [environment.get_state().task]
     for _ in range(steps):
@@ -321,7 +321,7 @@ def test_probes_show_what_they_should(name):
 
 @pytest.mark.parametrize("game", ["seek", "probe:memory"])
 def test_jax_environments_begin_anew_after_a_terminal(game):
-    environment = envs.make(config(game), num_envs=8, seed=5)
+    environment = make(config(game), num_envs=8, seed=5)
     assert (environment.num_actions, environment.crop_top) == (2, None)
     run = play(environment, random_actions(200, 8, 2))
     assert run.is_terminal.sum() >= 16
@@ -334,7 +334,7 @@ def test_jax_environments_begin_anew_after_a_terminal(game):
 
 def test_a_saved_state_goes_on_bit_for_bit():
     """Across an episode's end, so that the next episode's randomness is saved too."""
-    first, second = (envs.make(config("seek"), num_envs=3, seed=seed) for seed in (1, 2))
+    first, second = (make(config("seek"), num_envs=3, seed=seed) for seed in (1, 2))
     actions = random_actions(150, 3, 2).astype(np.int32)
     first.reset()
     for action in actions[:90]:
@@ -350,7 +350,7 @@ def test_a_saved_state_goes_on_bit_for_bit():
 
 def test_environments_differ_and_a_seed_repeats():
     actions = random_actions(100, 3, 2)
-    run, again, other = (play(envs.make(config("seek"), num_envs=3, seed=seed), actions) for seed in (1, 1, 2))
+    run, again, other = (play(make(config("seek"), num_envs=3, seed=seed), actions) for seed in (1, 1, 2))
     np.testing.assert_array_equal(run.frame, again.frame)
     np.testing.assert_array_equal(run.reward, again.reward)
     assert np.any(run.frame != other.frame)
@@ -369,7 +369,7 @@ def test_the_pure_functions_scanned_are_the_host_environment():
 
 
 def test_jax_environments_render_gray():
-    environment = envs.make(config("seek"), num_envs=2, seed=0)
+    environment = make(config("seek"), num_envs=2, seed=0)
     timestep, _ = environment.reset()
     np.testing.assert_array_equal(environment.render(), np.stack([timestep.frame] * 3, axis=-1))
 
@@ -435,7 +435,7 @@ def reference_frame(image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(160, 240, 3), (80, 160, 1), (80, 80)])
 def test_gymnasium_images_become_gray_frames(pixels, shape):
-    environment = envs.make(pixels(shape), num_envs=1, seed=0)
+    environment = make(pixels(shape), num_envs=1, seed=0)
     assert (environment.num_actions, environment.crop_top) == (2, None)
     run = play(environment, np.zeros((3, 1)))
     reference = Pixels(shape)
@@ -446,7 +446,7 @@ def test_gymnasium_images_become_gray_frames(pixels, shape):
 
 
 def test_gymnasium_episodes_end_as_the_others_do(pixels):
-    environment = envs.make(pixels(), num_envs=2, seed=0)
+    environment = make(pixels(), num_envs=2, seed=0)
     run = play(environment, np.tile([0, 1], (13, 1)))
     np.testing.assert_array_equal(np.flatnonzero(run.is_terminal[:, 0]), [5, 11])
     np.testing.assert_array_equal(np.flatnonzero(run.is_first[:, 0]), [0, 6, 12])
@@ -457,18 +457,18 @@ def test_gymnasium_episodes_end_as_the_others_do(pixels):
 
 
 def test_gymnasium_step_limit_is_no_terminal(pixels):
-    run = play(envs.make(pixels(max_episode_steps=3, clip_rewards=False), num_envs=1, seed=0), np.zeros((9, 1)))
+    run = play(make(pixels(max_episode_steps=3, clip_rewards=False), num_envs=1, seed=0), np.zeros((9, 1)))
     assert not np.any(run.is_terminal)
     np.testing.assert_array_equal(np.flatnonzero(run.is_over), [3, 7])
     np.testing.assert_array_equal(np.flatnonzero(run.is_first), [0, 4, 8])
     np.testing.assert_array_equal(run.reward, run.score)
     # An episode that ends at the very limit does end.
-    run = play(envs.make(pixels(max_episode_steps=5), num_envs=1, seed=0), np.zeros((6, 1)))
+    run = play(make(pixels(max_episode_steps=5), num_envs=1, seed=0), np.zeros((6, 1)))
     np.testing.assert_array_equal(np.flatnonzero(run.is_terminal & run.is_over), [5])
 
 
 def test_gymnasium_renders(pixels):
-    environment = envs.make(pixels(), num_envs=2, seed=0, render=True)
+    environment = make(pixels(), num_envs=2, seed=0, render=True)
     environment.reset()
     environment.send(np.zeros(2, np.int32))
     environment.recv()
@@ -492,7 +492,7 @@ class Bare(Pixels):
 def test_gymnasium_without_rendering_shows_its_images(shape):
     gymnasium.register("Bare-v0", entry_point=Bare, kwargs={"shape": shape})
     try:
-        environment = envs.make(config("gymnasium:Bare-v0"), num_envs=2, seed=0, render=True)
+        environment = make(config("gymnasium:Bare-v0"), num_envs=2, seed=0, render=True)
     finally:
         del gymnasium.registry["Bare-v0"]
     environment.reset()
@@ -513,7 +513,7 @@ class Strict(Pixels):
 def test_gymnasium_that_cannot_be_told_to_render_shows_its_images(monkeypatch):
     spec = gymnasium.envs.registration.EnvSpec("Strict-v0", entry_point=Strict, kwargs={"shape": (8, 9)})
     monkeypatch.setitem(gymnasium.registry, "Strict-v0", spec)
-    environment = envs.make(config("gymnasium:Strict-v0"), num_envs=2, seed=0, render=True)
+    environment = make(config("gymnasium:Strict-v0"), num_envs=2, seed=0, render=True)
     environment.reset()
     assert environment.render().shape == (2, 8, 9, 3)
 

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 
 from foajax.config.parse import ConfigError
 from foajax.config.schema import LogPolarSensor, RingSensor
-from foajax.sensors.sense import PixelCount, image_shapes, picture, pixel_count, ring_boxes, sense
+from foajax.sensors.reconstruct import picture
+from foajax.sensors.sense import PixelCount, image_shapes, pixel_count, ring_boxes, sense
 
 DECREASING = ((30, 30, 1), (50, 50, 2), (70, 70, 4))
 # Table II: rings, peripheral grid, pixel-values there, and values shown by count of blocks and cells.

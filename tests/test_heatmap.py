@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from foajax.sensors import gaze
 from foajax.viewing import heatmap
 from foajax.viewing.heatmap import HeatMap
 
@@ -15,7 +16,7 @@ from foajax.viewing.heatmap import HeatMap
 def by_hand():
     """Eight steps: four at (2, 3), two at (2, 4), one each at two corners of what may be looked at."""
     points = np.array([[2, 3]] * 4 + [[2, 4]] * 2 + [[1, 1], [3, 6]])
-    counts = heatmap.count(points, (5, 8))
+    counts = gaze.count(points, (5, 8))
     return HeatMap(counts, np.full((5, 8), 0.5), np.array([1, 1]), np.array([3, 6]), games=1)
 
 
@@ -29,9 +30,7 @@ def test_the_numbers():
 
 
 def test_a_gaze_that_never_moves_has_no_entropy():
-    heat = HeatMap(
-        heatmap.count(np.array([[2, 2]] * 9), (5, 5)), np.zeros((5, 5)), np.array([2, 2]), np.array([2, 2]), 1
-    )
+    heat = HeatMap(gaze.count(np.array([[2, 2]] * 9), (5, 5)), np.zeros((5, 5)), np.array([2, 2]), np.array([2, 2]), 1)
     assert heat.entropy == 0 and heat.share_at_bounds == 1
     heatmap.draw(heat, "still")
 

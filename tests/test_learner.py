@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from foajax.config import compose
+from foajax.envs.make import make_environments
 from foajax.learning import learner, losses
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_programs, make_state, total_updates
 from foajax.sensors.frames import PIXEL_DECAY
-from foajax.train import make_environments
 from foajax.training.collector import Collector, update_on
 
 # Small networks and short rollouts: most of the time goes into compiling them.

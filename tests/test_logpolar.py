@@ -12,7 +12,8 @@ import pytest
 
 from foajax.config.schema import LogPolarSensor
 from foajax.sensors import logpolar
-from foajax.sensors.sense import picture, ring_boxes, sense
+from foajax.sensors.reconstruct import picture
+from foajax.sensors.sense import ring_boxes, sense
 
 SENSORS = {
     f"{name}-{sampling}": LogPolarSensor(**fields, sampling=sampling)

@@ -9,6 +9,7 @@ import pytest
 from foajax.config import compose
 from foajax.config.schema import NetworkConfig
 from foajax.networks.network import initial_core_state, initial_params, make_network, make_torso
+from foajax.sensors.sense import image_shapes
 
 EXPERIMENTS = compose.list_experiments()
 
@@ -16,12 +17,11 @@ EXPERIMENTS = compose.list_experiments()
 def build(*overrides):
     config = compose.compose(overrides)
     network = make_network(config, 4)
-    return config, network, lambda: jax.jit(lambda key: initial_params(network, key, config))(jax.random.key(0))
+    shapes = image_shapes(config.sensor, config.env.frame_shape)
+    return config, network, lambda: jax.jit(lambda key: initial_params(network, key, shapes))(jax.random.key(0))
 
 
 def inputs(config, steps, batch):
-    from foajax.sensors.sense import image_shapes
-
     rng = np.random.default_rng(0)
     shapes = image_shapes(config.sensor, config.env.frame_shape)
     roi = [jnp.asarray(rng.normal(size=(steps, batch, *shape)), jnp.float32) for shape in shapes]

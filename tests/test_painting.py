@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from foajax.config.schema import LogPolarSensor, RingSensor
-from foajax.sensors.reconstruct import packed, paint, tables
-from foajax.sensors.sense import picture, sense
+from foajax.sensors.reconstruct import packed, paint, picture, tables
+from foajax.sensors.sense import sense
 
 SENSORS = {
     "rings": RingSensor(rings=((10, 12, 1), (20, 20, 2), (30, 28, 4)), peripheral=(5, 5)),

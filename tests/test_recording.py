@@ -9,14 +9,13 @@ import pytest
 from foajax import evaluate
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
-from foajax.envs import make as envs
+from foajax.envs.make import action_names, steps_per_second
 from foajax.evaluate import play
 from foajax.learning.agent import Agent
 from foajax.sensors.frames import to_frame
-from foajax.sensors.gaze import DIRECTIONS
+from foajax.sensors.gaze import DIRECTIONS, bounds
 from foajax.sensors.reconstruct import packed
 from foajax.types import Outcome, TimeStep
-from foajax.viewing.heatmap import bounds
 from foajax.viewing.recording import Screens, record
 
 
@@ -169,7 +168,7 @@ def test_screens_are_kept_exactly():
 
 
 def test_actions_have_names_where_the_game_has_them():
-    assert envs.action_names(compose(["game=pong"])) == ("noop", "fire", "right", "left", "rightfire", "leftfire")
-    assert envs.action_names(compose(["game=gymnasium:CarRacing-v3"])) is None
-    assert envs.steps_per_second(compose(["env.frame_skip=2"])) == 30
-    assert envs.steps_per_second(compose(["game=seek"])) == 15
+    assert action_names(compose(["game=pong"])) == ("noop", "fire", "right", "left", "rightfire", "leftfire")
+    assert action_names(compose(["game=gymnasium:CarRacing-v3"])) is None
+    assert steps_per_second(compose(["env.frame_skip=2"])) == 30
+    assert steps_per_second(compose(["game=seek"])) == 15

@@ -14,7 +14,7 @@ from foajax.config.schema import Config
 from foajax.learning.losses import log_prob
 from foajax.networks import network as networks
 from foajax.sensors import frames, gaze
-from foajax.sensors.sense import sense
+from foajax.sensors.sense import image_shapes, sense
 from foajax.types import (
     SCREEN_SHAPE,
     ActorOutput,
@@ -44,7 +44,8 @@ class Agent:
 
     def initial_params(self, key: PRNGKeyArray) -> Params:
         """Parameters before any learning."""
-        return networks.initial_params(self.network, key, self.config)
+        shapes = image_shapes(self.config.sensor, self.config.env.frame_shape)
+        return networks.initial_params(self.network, key, shapes)
 
     def initial_statistics(self) -> FrameStatistics:
         """Frame statistics before any frame."""

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from foajax.config.schema import Config, NetworkConfig, RingSensor
 from foajax.networks.convolution import convolve, max_pool
 from foajax.networks.lstm import lstm
-from foajax.sensors.sense import image_shapes
 from foajax.types import CoreState, NetworkOutput, Params
 
 _RELU_GAIN = math.sqrt(2.0)  # keeps the variance through a ReLU (He et al. 2015)
@@ -172,10 +171,9 @@ def make_network(config: Config, num_natural_actions: int) -> Network:
     )
 
 
-def initial_params(network: Network, key: Array, config: Config) -> Params:
-    """Parameters for the images that the experiment's sensor gives."""
-    shapes = image_shapes(config.sensor, config.env.frame_shape)
-    roi = [jnp.zeros((1, 1, *shape)) for shape in shapes]
+def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[int, int, int]]) -> Params:
+    """Parameters for images of these shapes (h, w, channels), which the sensor gives."""
+    roi = [jnp.zeros((1, 1, *shape)) for shape in image_shapes]
     core_state = initial_core_state(network, 1)
     return network.init(key, roi, jnp.zeros((1, 1, 2)), jnp.zeros((1, 1), bool), core_state)
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from foajax.config.parse import ConfigError
-from foajax.config.schema import GazeConfig
+from foajax.config.schema import Config, GazeConfig
 
 Shape = tuple[int, int]  # rows, columns
 
@@ -100,3 +100,15 @@ def from_unit(coordinates: Float[Array, "*n 2"], frame_shape: Shape) -> Int[Arra
 def _clip(point: Int[Array, "2"], gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Array, "2"]:
     low, high = limits(gaze=gaze, window=window, frame_shape=frame_shape)
     return jnp.clip(point, low, high).astype(jnp.int32)
+
+
+def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[np.ndarray, "H W"]:
+    """How many of the focal points (y, x) are at each pixel."""
+    counts = np.zeros(frame_shape, int)
+    np.add.at(counts, tuple(points.T), 1)
+    return counts
+
+
+def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest focal point (y, x)."""
+    return limits(gaze=config.gaze, window=config.sensor.window, frame_shape=config.env.frame_shape)

@@ -1,6 +1,6 @@
-"""From the values of a sensor to the picture of what it sees, as one table of indices.
+"""From the values of a sensor to the picture of what it sees, directly or as one table of indices.
 
-`foveation.picture` puts what a sensor gave back in the frame's place. Which value a pixel shows depends only on the
+`picture` puts what a sensor gave back in the frame's place. Which value a pixel shows depends only on the
 pixel's place in the focal area or, outside of it, in the frame. So a recording needs to keep the values alone, and
 whoever draws them, in whatever language, needs two tables.
 """
@@ -8,14 +8,48 @@ whoever draws them, in whatever language, needs two tables.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
-from foajax.config.schema import RingSensor, Sensor
-from foajax.sensors.sense import image_shapes, picture
+from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
+from foajax.sensors import logpolar
+from foajax.sensors.rings import canvas
+from foajax.sensors.sense import image_shapes
+from foajax.sensors.window import Shape, place
+
+
+def picture(
+    images: tuple[Float[Array, "_ _ C"], ...],
+    focal_point: Int[Array, "2"],
+    *,
+    sensor: Sensor,
+    frame_shape: Shape,
+) -> Float[Array, "H W C"]:
+    """What `sense` gave, put back in the frame's place; 0 where nothing was seen.
+
+    Both layouts of a `RingSensor` give the canvas; a log-polar image is warped back. `focal_point` is where the area
+    lay: with bounds 'window', the point after it was moved inside.
+    """
+    if isinstance(sensor, RingSensor) and sensor.layout == "canvas":
+        return images[0]
+    gray = functools.partial(_picture_gray, focal_point=focal_point, sensor=sensor, frame_shape=frame_shape)
+    return jax.vmap(gray, in_axes=2, out_axes=2)(images)
+
+
+def _picture_gray(
+    images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], sensor: Sensor, frame_shape: Shape
+) -> Float[Array, "H W"]:
+    """`picture` for one channel."""
+    corner = focal_point - np.array(sensor.window) // 2
+    if isinstance(sensor, LogPolarSensor):
+        return place(logpolar.unwarp(images[0], sensor=sensor), corner, frame_shape)
+    parts, cells = images[: len(sensor.rings)], images[len(sensor.rings) :]
+    return canvas(parts, cells[0] if cells else None, corner, sensor, frame_shape)
 
 
 class Painting(NamedTuple):

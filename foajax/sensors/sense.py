@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,18 @@ from jaxtyping import Array, Float, Int, Num
 from foajax.config.parse import ConfigError
 from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
 from foajax.sensors import logpolar
+from foajax.sensors.rings import (
+    block_edges,
+    block_sums,
+    canvas,
+    cell_edges,
+    covered,
+    hidden_blocks,
+    offsets,
+    sense_cells,
+)
+from foajax.sensors.window import Shape, apart, gather_window
 from foajax.types import HostArray
-
-Shape = tuple[int, int]  # rows, columns
 
 
 class PixelCount(NamedTuple):
@@ -96,24 +105,6 @@ def sense(
     return jax.vmap(gray, in_axes=2, out_axes=2)(frame)
 
 
-def picture(
-    images: tuple[Float[Array, "_ _ C"], ...],
-    focal_point: Int[Array, "2"],
-    *,
-    sensor: Sensor,
-    frame_shape: Shape,
-) -> Float[Array, "H W C"]:
-    """What `sense` gave, put back in the frame's place; 0 where nothing was seen.
-
-    Both layouts of a `RingSensor` give the canvas; a log-polar image is warped back. `focal_point` is where the area
-    lay: with bounds 'window', the point after it was moved inside.
-    """
-    if isinstance(sensor, RingSensor) and sensor.layout == "canvas":
-        return images[0]
-    gray = functools.partial(_picture_gray, focal_point=focal_point, sensor=sensor, frame_shape=frame_shape)
-    return jax.vmap(gray, in_axes=2, out_axes=2)(images)
-
-
 def image_shapes(sensor: Sensor, frame_shape: Shape) -> tuple[tuple[int, int, int], ...]:
     """Shapes (h, w, 1) of what `sense` gives for a gray frame of `frame_shape`, part by part."""
     if isinstance(sensor, LogPolarSensor):
@@ -139,11 +130,11 @@ def pixel_count(sensor: Sensor, frame_shape: Shape) -> PixelCount:
         nominal += (height * width - inner) / factor**2
         inner = height * width
     shapes = image_shapes(dataclasses.replace(sensor, layout="packed"), frame_shape)
-    actual = sum(math.prod(shape) for shape in shapes) - sum(int(h.sum()) for h in _hidden_blocks(sensor))
+    actual = sum(math.prod(shape) for shape in shapes) - sum(int(h.sum()) for h in hidden_blocks(sensor))
     if sensor.peripheral is not None:
         least = centred = 1  # cells hidden along one axis, times those along the other
-        for edges, size, length in zip(_cell_edges(sensor, frame_shape), frame_shape, sensor.window, strict=True):
-            hidden = [int(_covered(edges, first, length).sum()) for first in range(size - length + 1)]
+        for edges, size, length in zip(cell_edges(sensor, frame_shape), frame_shape, sensor.window, strict=True):
+            hidden = [int(covered(edges, first, length).sum()) for first in range(size - length + 1)]
             least, centred = least * min(hidden), centred * hidden[size // 2 - length // 2]
         nominal, actual = nominal + math.prod(sensor.peripheral) - least, actual - centred
     return PixelCount(round(nominal), actual)
@@ -167,27 +158,16 @@ def _sense_gray(
     if isinstance(sensor, LogPolarSensor):
         return parts
     height, width = frame.shape
-    cells = None if sensor.peripheral is None else _sense_cells(frame, sensor)
+    cells = None if sensor.peripheral is None else sense_cells(frame, sensor)
     if sensor.layout == "canvas":
-        return (_canvas(parts, cells, corner, sensor, (height, width)),)
-    hidden = _hidden_blocks(sensor)
+        return (canvas(parts, cells, corner, sensor, (height, width)),)
+    hidden = hidden_blocks(sensor)
     images = [parts[0], *(jnp.where(h, 0.0, part) for h, part in zip(hidden, parts[1:], strict=True))]
     if cells is not None:
-        edges = _cell_edges(sensor, (height, width))
-        rows, columns = (_covered(edges[axis], corner[axis], sensor.window[axis]) for axis in (0, 1))
+        edges = cell_edges(sensor, (height, width))
+        rows, columns = (covered(edges[axis], corner[axis], sensor.window[axis]) for axis in (0, 1))
         images.append(jnp.where(rows[:, None] & columns[None], 0.0, cells))
     return tuple(images)
-
-
-def _picture_gray(
-    images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], sensor: Sensor, frame_shape: Shape
-) -> Float[Array, "H W"]:
-    """`picture` for one channel."""
-    corner = focal_point - np.array(sensor.window) // 2
-    if isinstance(sensor, LogPolarSensor):
-        return _place(logpolar.unwarp(images[0], sensor=sensor), corner, frame_shape)
-    parts, cells = images[: len(sensor.rings)], images[len(sensor.rings) :]
-    return _canvas(parts, cells[0] if cells else None, corner, sensor, frame_shape)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
@@ -200,12 +180,12 @@ def _look(frame: Num[Array, "H W"], corner: Int[Array, "2"], sensor: Sensor) -> 
     """
     size = sensor.window
     if any(length > limit for length, limit in zip(size, frame.shape, strict=True)):
-        return _pool(_gather_window(frame, corner, size), sensor)
+        return _pool(gather_window(frame, corner, size), sensor)
     start = jnp.clip(corner, 0, np.array(frame.shape) - size)
 
     def look_again(state):
         # What does not depend on the state would be moved out of the loop, and always run.
-        window = _apart(_gather_window(frame, start + state[0], size), corner)
+        window = apart(gather_window(frame, start + state[0], size), corner)
         return jnp.zeros_like(state[0]), _pool(window, sensor)
 
     parts = _pool(lax.dynamic_slice(frame, start, size), sensor)
@@ -216,34 +196,7 @@ def _look(frame: Num[Array, "H W"], corner: Int[Array, "2"], sensor: Sensor) -> 
 def _look_jvp(sensor, primals, tangents):
     # Linear in the frame; the loops are for speed, and cannot be transposed.
     frame, corner = primals
-    return _look(frame, corner, sensor), _pool(_gather_window(tangents[0], corner, sensor.window), sensor)
-
-
-def _gather_window(image: Num[Array, "H W"], corner: Int[Array, "2"], size: Shape) -> Num[Array, "h w"]:
-    """Cuts an area of `size` with its top-left pixel at `corner` out of an image, 0 where it overhangs."""
-    height, width = image.shape
-    rows, columns = (first + jnp.arange(length) for first, length in zip(corner, size, strict=True))
-    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))[None]
-    index = jnp.clip(rows, 0, height - 1)[:, None] * width + jnp.clip(columns, 0, width - 1)[None]
-    return jnp.where(inside, image.reshape(-1).at[index].get(mode="promise_in_bounds"), 0)
-
-
-def _apart(window: Num[Array, "h w"], corner: Int[Array, "2"]) -> Num[Array, "h w"]:
-    """The same window, worked out before it is used.
-
-    Fused into what uses it, a gather is three times slower, and XLA drops optimisation barriers
-    before it fuses. A loop that never turns keeps them apart.
-    """
-    never = corner[0] == np.iinfo(corner.dtype).min
-    return lax.while_loop(lambda state: state[0], lambda state: jax.tree.map(jnp.zeros_like, state), (never, window))[1]
-
-
-def _place(image: Float[Array, "h w"], corner: Int[Array, "2"], frame_shape: Shape) -> Float[Array, "H W"]:
-    """Puts an image into an empty frame: the inverse of `_gather_window`."""
-    # XLA reads through the padding and never lays it out.
-    padded = jnp.pad(image, [(size, size) for size in frame_shape])
-    # A start below 0 would count from the end.
-    return lax.dynamic_slice(padded, jnp.maximum(np.array(frame_shape) - corner, 0), frame_shape)
+    return _look(frame, corner, sensor), _pool(gather_window(tangents[0], corner, sensor.window), sensor)
 
 
 def _pool(window: Num[Array, "h w"], sensor: Sensor) -> tuple[Float[Array, "_ _"], ...]:
@@ -252,116 +205,13 @@ def _pool(window: Num[Array, "h w"], sensor: Sensor) -> tuple[Float[Array, "_ _"
     if isinstance(sensor, LogPolarSensor):
         return (logpolar.warp(window, sensor=sensor),)
     parts = []
-    for (height, width, factor), (top, left) in zip(sensor.rings, _offsets(sensor), strict=True):
+    for (height, width, factor), (top, left) in zip(sensor.rings, offsets(sensor), strict=True):
         area = window[top : top + height, left : left + width]
         if sensor.pooling == "stride" or factor == 1:
             parts.append(area[::factor, ::factor])
             continue
         # Rows first: they are added up whole before anything is picked apart.
-        sums = _block_sums(_block_sums(area, factor, 0), factor, 1)
-        rows, columns = (np.diff(_block_edges(size, factor)) for size in (height, width))
+        sums = block_sums(block_sums(area, factor, 0), factor, 1)
+        rows, columns = (np.diff(block_edges(size, factor)) for size in (height, width))
         parts.append(sums / np.outer(rows, columns).astype(np.float32))
     return tuple(parts)
-
-
-def _block_sums(x: Float[Array, "_ _"], factor: int, axis: int) -> Float[Array, "_ _"]:
-    """Sums over consecutive `factor` rows or columns; the last block may have fewer.
-
-    Added up as strided slices: on a CPU many times faster than to reduce a reshaped axis.
-    """
-    size = x.shape[axis]
-    whole = size - size % factor
-    slices = [lax.slice_in_dim(x, first, whole, factor, axis) for first in range(factor)]
-    sums = functools.reduce(jnp.add, slices)
-    if whole == size:
-        return sums
-    rest = lax.slice_in_dim(x, whole, size, axis=axis).sum(axis, keepdims=True)
-    return jnp.concatenate([sums, rest], axis)
-
-
-def _sense_cells(frame: Num[Array, "H W"], sensor: RingSensor) -> Float[Array, "rows columns"]:
-    """The peripheral grid: the whole frame, coarse, nothing hidden yet."""
-    height, width = frame.shape
-    rows, columns = _cell_edges(sensor, (height, width))
-    if not (np.diff(rows).all() and np.diff(columns).all()):
-        accepted = f"a grid no finer than the frame, {height}x{width}"
-        raise ConfigError(f"sensor.peripheral={sensor.peripheral}: accepted is {accepted}")
-    if sensor.pooling == "stride":
-        return frame[rows[:-1]][:, columns[:-1]].astype(jnp.float32)
-    # Whole columns of the product are contiguous sums; 'highest' keeps accelerators from rounding.
-    means = jnp.einsum("hw,vw->hv", frame.astype(jnp.float32), _averages(columns), precision="highest")
-    return jnp.einsum("hv,uh->uv", means, _averages(rows), precision="highest")
-
-
-def _averages(edges: np.ndarray) -> np.ndarray:
-    """A matrix [n, size] that takes the means over the n intervals between `edges`."""
-    position = np.arange(edges[-1])
-    inside = (position >= edges[:-1, None]) & (position < edges[1:, None])
-    return (inside / np.diff(edges)[:, None]).astype(np.float32)
-
-
-def _canvas(
-    parts: tuple[Float[Array, "_ _"], ...],
-    cells: Float[Array, "_ _"] | None,
-    corner: Int[Array, "2"],
-    sensor: RingSensor,
-    frame_shape: Shape,
-) -> Float[Array, "H W"]:
-    """Paints every value over the pixels that it stands for, coarse to fine."""
-    area = jnp.zeros(sensor.window, jnp.float32)
-    for part, (height, width, factor), (top, left) in reversed(
-        [*zip(parts, sensor.rings, _offsets(sensor), strict=True)]
-    ):
-        blocks = jnp.repeat(jnp.repeat(part, factor, 1), factor, 0)[:height, :width]
-        area = area.at[top : top + height, left : left + width].set(blocks)
-    frame = _place(area, corner, frame_shape)
-    if cells is None:
-        return frame
-    for axis, edges in enumerate(_cell_edges(sensor, frame_shape)):
-        cells = _repeat(cells, np.diff(edges), axis)
-    rows, columns = (
-        (np.arange(size) >= first) & (np.arange(size) < first + length)
-        for size, first, length in zip(frame_shape, corner, sensor.window, strict=True)
-    )
-    return jnp.where(rows[:, None] & columns[None], frame, cells)
-
-
-def _repeat(x: Float[Array, "_ _"], counts: np.ndarray, axis: int) -> Float[Array, "_ _"]:
-    """Each row or column as often as `counts` says; equal counts need no gather."""
-    if (counts == counts[0]).all():
-        return jnp.repeat(x, int(counts[0]), axis)
-    return jnp.take(x, np.repeat(np.arange(len(counts)), counts), axis)
-
-
-def _offsets(sensor: RingSensor) -> list[Shape]:
-    """Top-left corners of the rings inside the focal area."""
-    height, width = sensor.window
-    return [(height // 2 - ring[0] // 2, width // 2 - ring[1] // 2) for ring in sensor.rings]
-
-
-def _block_edges(size: int, factor: int) -> np.ndarray:
-    """Where the blocks of a ring begin and end along an axis; the last one may be shorter."""
-    return np.append(np.arange(0, size, factor), size)
-
-
-def _cell_edges(sensor: RingSensor, frame_shape: Shape) -> list[np.ndarray]:
-    """Where the cells of the peripheral grid begin and end, along rows and along columns."""
-    assert sensor.peripheral is not None
-    return [np.arange(n + 1) * size // n for n, size in zip(sensor.peripheral, frame_shape, strict=True)]
-
-
-def _covered(edges: np.ndarray, first: Any, length: int) -> Any:
-    """Which of the intervals between `edges` lie altogether inside [first, first + length)."""
-    return (edges[:-1] >= first) & (edges[1:] <= first + length)
-
-
-def _hidden_blocks(sensor: RingSensor) -> list[np.ndarray]:
-    """Per ring but the first, which blocks [rows, columns] the next finer ring covers altogether."""
-    hidden = []
-    for inner, outer in zip(sensor.rings, sensor.rings[1:], strict=False):
-        rows, columns = (
-            _covered(_block_edges(size, outer[2]), size // 2 - length // 2, length)
-            for size, length in zip(outer[:2], inner[:2], strict=True)
-        )
-        hidden.append(rows[:, None] & columns)
-    return hidden

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from foajax.config.schema import LearnerConfig
-from foajax.envs.make import Environment
+from foajax.envs.base import Environment
 from foajax.learning.agent import Agent
 from foajax.learning.learner import Metrics
 from foajax.learning.programs import Programs, acting_keys, empty_rollout

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from foajax.config.schema import Config
-from foajax.envs.make import Environment
+from foajax.envs.base import Environment
 from foajax.learning.agent import Agent
 from foajax.learning.learner import loss
 from foajax.learning.programs import Programs, empty_rollout, make_programs, make_state

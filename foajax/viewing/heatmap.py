@@ -17,9 +17,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from foajax.config.parse import ConfigError
-from foajax.config.schema import Config
 from foajax.runs import durable
-from foajax.sensors.gaze import limits
+from foajax.sensors.gaze import bounds, count
 from foajax.viewing.recording import Recording
 from foajax.viewing.style import STYLE
 
@@ -103,18 +102,6 @@ def heat_map(recordings: Sequence[Recording]) -> HeatMap:
     whole = all(each.is_over for each in recordings)
     counts = count(points, config.env.frame_shape)
     return HeatMap(counts, mean, low, high, len(recordings), env_steps, policy, whole)
-
-
-def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[np.ndarray, "H W"]:
-    """How many of the focal points (y, x) are at each pixel."""
-    counts = np.zeros(frame_shape, int)
-    np.add.at(counts, tuple(points.T), 1)
-    return counts
-
-
-def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest focal point (y, x)."""
-    return limits(gaze=config.gaze, window=config.sensor.window, frame_shape=config.env.frame_shape)
 
 
 def save(heat: HeatMap, directory: Path, title: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from foajax.sensors import gaze
 from foajax.types import Rollout
 
 _SCALE = 4  # pixels of an image for one of the frame
@@ -23,8 +24,7 @@ def snapshots(rollout: Rollout, frame_shape: tuple[int, int]) -> dict[str, UInt8
 
 def heat_map(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> UInt8[np.ndarray, "_ _"]:
     """How often the focal point was where: logarithmic, white for the most, on dark gray."""
-    counts = np.zeros(frame_shape)
-    np.add.at(counts, tuple(points.T), 1)
+    counts = gaze.count(points, frame_shape)
     levels = np.where(counts > 0, 80 + 175 * np.log1p(counts) / np.log1p(counts.max()), 24)
     return _enlarged(levels)
 

@@ -14,7 +14,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
 from foajax import evaluate
 from foajax.config.schema import Config
-from foajax.envs import make as envs
+from foajax.envs.atari import is_atari
+from foajax.envs.base import Environment
+from foajax.envs.make import action_names
 from foajax.learning.agent import Agent
 from foajax.runs.agents import Stored
 from foajax.sensors.reconstruct import packed
@@ -120,7 +122,7 @@ def record(
       ConfigError: if there is no such game.
     """
     config = stored.agent.config
-    names = envs.action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
+    names = action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
     decide = jax.jit(functools.partial(_decide, stored.agent, greedy))
     for game in range(seed, seed + episodes):
         environment = evaluate.environment(stored, num_envs=1, seed=game, render=_in_colour(config))
@@ -140,7 +142,7 @@ def record(
 
 
 def _play(
-    environment: envs.Environment,
+    environment: Environment,
     stored: Stored,
     decide: Callable[..., tuple[_Row, Array, ActorState]],
     key: PRNGKeyArray,
@@ -199,7 +201,7 @@ def _decide(
 
 def _in_colour(config: Config) -> bool:
     """Whether the engine can show screens in colour; ale-py's vector environment keeps gray ones only."""
-    return config.env.engine != "ale" or not envs.is_atari(config)
+    return config.env.engine != "ale" or not is_atari(config)
 
 
 def _columns(rows: Sequence[_Row]) -> dict[str, Any]:
