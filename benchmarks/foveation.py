@@ -22,11 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from foajax import cli, cost
+from foajax import cli, runtime
 from foajax.config.compose import compose
 from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
 from foajax.sensors.sense import sense
-from foajax.show import PAPER
+from foajax.viewing.sheet import PAPER
 
 TABLE_II = {name: compose([f"experiment={name}"]).sensor for name in PAPER}
 CONSTANT70_PACKED = RingSensor(((70, 70, 2),), layout="packed")
@@ -128,7 +128,7 @@ class Options:
 def main(arguments: Sequence[str]) -> None:
     """Runs all three and writes JSON where `out=<file>` says so."""
     options = cli.parse(Options, arguments)
-    cost.wait_in_place()
+    runtime.wait_in_place()
     results: dict[str, object] = {
         "device": jax.devices()[0].device_kind,
         "cpus": os.cpu_count(),

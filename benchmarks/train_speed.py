@@ -37,8 +37,8 @@ from foajax.config.parse import ConfigError
 from foajax.config.schema import Config
 from foajax.envs.make import make_environments
 from foajax.learning.agent import Agent
-from foajax.learning.programs import make_programs, make_state, use_compilation_cache
-from foajax.runtime import keep_memory
+from foajax.learning.programs import make_programs, make_state
+from foajax.runtime import keep_memory, use_compilation_cache
 from foajax.training.collector import Collector, update_on
 
 PARTS = ("env_only", "act_only", "update_only", "end_to_end")

@@ -102,3 +102,14 @@ def _help(module: Any) -> str:
         shown = "required" if value is dataclasses.MISSING else value if isinstance(value, str) else json.dumps(value)
         lines.append(f"  {field.name}={shown}: {describe(hints[field.name])}")
     return "\n".join(lines)
+
+
+def make_directory(out: str | Path) -> Path:
+    """Creates the directory for results; one line where that cannot be."""
+    try:
+        Path(out).mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise ConfigError(f"out={out}: accepted is a directory that can be written ({error.strerror})") from None
+    return Path(out)

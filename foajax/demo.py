@@ -15,11 +15,11 @@ from pathlib import Path
 from foajax import cli
 from foajax.config.parse import ConfigError
 from foajax.config.shipped import agents
-from foajax.learning.programs import use_compilation_cache
-from foajax.player import write_page
-from foajax.render import make_directory, play, progress_bar
 from foajax.runs.agents import load_agent, load_score
 from foajax.runs.directory import load_config
+from foajax.runtime import use_compilation_cache
+from foajax.viewing.player_page import write_page
+from foajax.viewing.recording import play, progress_bar
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
 
@@ -60,7 +60,7 @@ def demo(arguments: Sequence[str]) -> None:
     """The command; prints the score and the page's path."""
     options = cli.parse(Options, arguments)
     path = choose(agents(), options.game)
-    stored, directory = load_agent(path), make_directory(options.out)
+    stored, directory = load_agent(path), cli.make_directory(options.out)
     use_compilation_cache()
     with progress_bar() as bar:
         recording = next(play(stored, bar, seed=options.seed, greedy=False, max_steps=options.steps))

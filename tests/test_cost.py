@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from foajax import cli, cost
+from foajax import cli
+from foajax import cost as command
 from foajax.config.compose import compose
 from foajax.learning.agent import Agent
 from foajax.networks.convolution import convolve, convolve_plain
+from foajax.reporting import cost
 
 KEYS = {
     *("experiment", "torso", "pixels_nominal", "pixels_actual", "torso_flops", "decision_flops", "params"),
@@ -99,7 +101,7 @@ def test_the_saving_is_what_the_readme_says():
 @pytest.mark.slow
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "cost.json"
-    assert cli.run(cost.cost, ["experiments=constant70_packed", "repeats=3", f"json={out}"]) == 0
+    assert cli.run(command.cost, ["experiments=constant70_packed", "repeats=3", f"json={out}"]) == 0
     records = json.loads(out.read_text())
     assert [record["experiment"] for record in records] == ["constant70_packed", "nonfoa"]
     for record in records:
@@ -124,7 +126,7 @@ def test_the_command(tmp_path, capsys):
     ],
 )
 def test_a_mistake_is_one_line(word, message, capsys):
-    assert cli.run(cost.cost, [word]) == 2
+    assert cli.run(command.cost, [word]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"foajax: error: {message}")
     assert error.count("\n") == 1

@@ -11,6 +11,7 @@ import pytest
 from foajax import cli, demo, evaluate, store
 from foajax.config.parse import ConfigError
 from foajax.runs import agents
+from foajax.viewing import games
 
 EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}
 
@@ -104,8 +105,8 @@ def test_a_shipped_agent_can_be_read_and_has_its_score(path):
 @pytest.mark.slow
 def test_a_shipped_agent_plays_as_well_as_it_says():
     stored = agents.load_agent(demo.agents() / "pong-nonfoa")
-    games = evaluate.play(stored, episodes=2, num_envs=2, seed=0, greedy=False)
-    assert games.returns.mean() > 10
+    played = games.play(stored, episodes=2, num_envs=2, seed=0, greedy=False)
+    assert played.returns.mean() > 10
 
 
 def test_parameters_are_on_the_device(shipped):

@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import evaluate
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
 from foajax.envs.make import action_names, steps_per_second
-from foajax.evaluate import play
 from foajax.learning.agent import Agent
 from foajax.sensors.frames import to_frame
 from foajax.sensors.gaze import DIRECTIONS, bounds
 from foajax.sensors.reconstruct import packed
 from foajax.types import Outcome, TimeStep
+from foajax.viewing import games
+from foajax.viewing.games import play
 from foajax.viewing.recording import Screens, record
 
 
@@ -132,9 +132,9 @@ class UnequalGames:
 
 
 def test_each_environment_plays_the_same_number_of_games(seeker, monkeypatch):
-    monkeypatch.setattr(evaluate, "environment", lambda *_, **__: UnequalGames())
-    games = play(seeker, episodes=4, num_envs=2, seed=0, greedy=False)
-    assert sorted(games.lengths) == sorted(games.returns) == [2, 2, 5, 5]
+    monkeypatch.setattr(games, "environment", lambda *_, **__: UnequalGames())
+    played = play(seeker, episodes=4, num_envs=2, seed=0, greedy=False)
+    assert sorted(played.lengths) == sorted(played.returns) == [2, 2, 5, 5]
 
 
 def test_a_game_of_other_actions_is_refused(seeker):

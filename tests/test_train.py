@@ -19,7 +19,8 @@ from foajax.launch.processes import Job
 from foajax.runs.agents import load_agent, save_agent
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import load_config, open_run
-from foajax.train import Run, train
+from foajax.train import train
+from foajax.training.run import Run
 
 
 def same(one, other):

@@ -28,6 +28,11 @@ def one_line(*parts: object) -> str:
     return " ".join(" ".join(map(str, parts)).split())
 
 
+def file_name(text: str) -> str:
+    """A text as a part of a file's name."""
+    return "".join(c if c.isalnum() or c in "_-." else "-" for c in text)
+
+
 def brief(value: object) -> str:
     """A value in one line, of 80 characters at most."""
     text = str(list(value)) if isinstance(value, tuple) else str(value)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from foajax.config.parse import build, check, check_types
+from foajax.config.parse import build, check, check_types, file_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -337,8 +337,7 @@ class Config:
     @property
     def run_dir(self) -> str:
         """Where the run's files are."""
-        game = "".join(c if c.isalnum() or c in "_-." else "-" for c in self.game)
-        return self.run or f"runs/{game}-{self.name}-s{self.seed}"
+        return self.run or f"runs/{file_name(self.game)}-{self.name}-s{self.seed}"
 
 
 def check_address(key: str, value: str) -> None:

@@ -24,6 +24,11 @@ def experiments() -> Path:
     return directory
 
 
+def kept_runs() -> Path:
+    """What is kept of runs; in a checkout only."""
+    return _PACKAGE.parent / "results" / "runs"
+
+
 def _find(name: str) -> Path:
     inside = _PACKAGE / name
     return inside if inside.is_dir() else _PACKAGE.parent / name

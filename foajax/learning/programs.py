@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -125,10 +124,3 @@ def _act(
         lambda kept, now: jnp.where(row == 0, now, kept), rollout.core_state, actor_state.core_state
     )
     return output.natural_action, next_state, Rollout(steps=steps, core_state=core_state)
-
-
-def use_compilation_cache() -> None:
-    """Compiled programs are kept for the next start, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        jax.config.update("jax_compilation_cache_dir", os.path.join(cache, "foajax"))

@@ -25,8 +25,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 from foajax.config.parse import ConfigError
+from foajax.config.schema import Config
 from foajax.launch.signals import signal_in
+from foajax.runs.agents import CHECKPOINTS
+from foajax.runs.checkpoints import Checkpoints
 
 FAULT = 3  # exit code: an environment raised or hung; the same command goes on
 GRACE = 5.0  # seconds that the main thread has to answer one of them, of the 10 that a cluster may leave
@@ -160,3 +165,15 @@ def record(run_dir: Path, error: BaseException | None) -> Path:
         else:
             traceback.print_exception(error, file=file)
     return path
+
+
+def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:
+    """One line on stderr about an environment that raised or hung; returns the exit code."""
+    run_dir = Path(config.run_dir)
+    steps = Checkpoints(run_dir / CHECKPOINTS, keep=None).steps()
+    saved = f"saved at {steps[-1]:,} env_steps, the same command goes on from there" if steps else "nothing to save yet"
+    if jax.process_index():
+        saved = "the first process saves what it can"
+    line = f"game={config.game}: {what}; {saved}; details in {record(run_dir, error)}"
+    print(f"foajax: error: {line}", file=sys.stderr, flush=True)
+    return FAULT

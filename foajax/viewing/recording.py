@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from foajax import evaluate
 from foajax.config.schema import Config
 from foajax.envs.atari import is_atari
 from foajax.envs.base import Environment
@@ -22,8 +22,9 @@ from foajax.runs.agents import Stored
 from foajax.sensors.reconstruct import packed
 from foajax.sensors.sense import sense
 from foajax.types import ActorOutput, ActorState, FrameStatistics, NetworkOutput, Params, TimeStep
+from foajax.viewing import games
 
-Progress = Callable[[int, float], None]  # told the steps played so far and the score
+OnStep = Callable[[int, float], None]  # told the steps played so far and the score
 
 
 class Screens(Sequence):
@@ -106,7 +107,7 @@ def record(
     seed: int = 0,
     greedy: bool = False,
     max_steps: int | None = None,
-    progress: Progress | None = None,
+    progress: OnStep | None = None,
 ) -> Iterator[Recording]:
     """Plays whole games, one after another; each is the first one of `evaluate` with its seed and one environment.
 
@@ -125,7 +126,7 @@ def record(
     names = action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
     decide = jax.jit(functools.partial(_decide, stored.agent, greedy))
     for game in range(seed, seed + episodes):
-        environment = evaluate.environment(stored, num_envs=1, seed=game, render=_in_colour(config))
+        environment = games.environment(stored, num_envs=1, seed=game, render=_in_colour(config))
         try:
             played = _play(environment, stored, decide, jax.random.key(game), max_steps, progress)
         finally:
@@ -147,7 +148,7 @@ def _play(
     decide: Callable[..., tuple[_Row, Array, ActorState]],
     key: PRNGKeyArray,
     max_steps: int | None,
-    progress: Progress | None,
+    progress: OnStep | None,
 ) -> dict[str, Any]:
     """One game: the fields of a recording that come from playing."""
     config, state = stored.agent.config, stored.agent.initial_state(1)
@@ -232,3 +233,22 @@ def _softmax(logits: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
 
 def _gray(screen: np.ndarray) -> np.ndarray:
     return np.repeat(screen[..., None], 3, axis=-1)
+
+
+def play(stored: Stored, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
+    """`record`, with a bar for each game while it is played."""
+
+    def progress(steps: int, score: float) -> None:
+        bar.update(task, completed=steps, note=f"{steps:,} steps, score {score:g}")
+
+    games = record(stored, episodes=episodes, seed=seed, progress=progress, **how)
+    for game in range(seed, seed + episodes):
+        task = bar.add_task(f"game {game}", total=how["max_steps"], note="starts")
+        yield next(games)
+        bar.update(task, total=bar.tasks[task].completed)
+
+
+def progress_bar() -> Progress:
+    """Bars with a note at their end."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
+    return Progress(*columns)

@@ -1,43 +1,28 @@
-"""`python results/keep.py run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/`.
-
-Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
-json=<run>/score.json` has found, and `run.json`: command, commits, seed, machine, hours. Then the tables and the
-learning curves of all kept runs are made anew. Without `run=`, only that.
-"""
+"""Runs that are kept in `results/runs/`: what others need to judge and repeat them, and the tables of them."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import shlex
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from foajax import cli
+from foajax.config import shipped
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, flatten, to_mapping
-from foajax.report import games_of
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
+from foajax.reporting.groups import games_of
 from foajax.runs.directory import FREE, load_config
 from foajax.runs.status import newest_checkpoint
 from foajax.sensors.sense import pixel_count
 
-KEPT = Path(__file__).parent / "runs"
+KEPT = shipped.kept_runs()
 _ROWS = 500
 _MACHINE = ("cpu", "cores", "devices", "system", "python", "packages")
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """What the command takes."""
-
-    run: str | None = None  # a run's directory
-    name: str | None = None  # of the directory that it is kept in; null for <game>-<experiment>-s<seed>
 
 
 def keep(path: Path, name: str | None) -> Path:
@@ -60,7 +45,7 @@ def keep(path: Path, name: str | None) -> Path:
     rows = [row for row in rows if json.loads(row)["env_steps"] <= newest]
     chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
     (out / "metrics.jsonl").write_text("".join(rows[i] for i in chosen))
-    (out / "score.json").write_text(json.dumps(run.evaluation | {"run": out.name}, indent=1) + "\n")
+    (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")
     (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
     return out
 
@@ -110,12 +95,9 @@ def command_today(path: Path) -> str:
     return f"python -m foajax.train {shlex.join(given + more)} run=runs/{path.name}"
 
 
-def main(arguments: Sequence[str]) -> None:
-    """The command."""
-    options = cli.parse(Options, arguments)
-    if options.run is not None:
-        print(keep(Path(options.run), options.name))
-    paths = [path for path in sorted(KEPT.iterdir()) if path.is_dir()]
+def write_tables(directory: Path = KEPT) -> None:
+    """Makes the tables and the learning curves of all kept runs anew."""
+    paths = [path for path in sorted(directory.iterdir()) if path.is_dir()]
     runs = [_named(read_run(path)) for path in paths]
     head = ["game", "experiment", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     lines = [head, ["---"] * len(head), *map(row, runs)]
@@ -124,15 +106,11 @@ def main(arguments: Sequence[str]) -> None:
         "were stopped before their `train.env_steps`. Each `run.json` has the command, the commit and the machine.\n"
         "Steps and hours, here and in the curves, do not count those of an agent that a run began from\n"
         "(`train.init_from` in its command).\n"
-        "Made by `results/keep.py`."
+        "Made by `python -m foajax.keep`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     commands = "\n".join(map(command_today, paths))
     repeat = f"The same, in the words of today's defaults:\n\n```sh\n{commands}\n```"
-    (KEPT / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n\n{repeat}\n")
+    (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n\n{repeat}\n")
     for game, groups in games_of(runs, None).items():
-        draw_curves(groups, game, colours_of(groups)).savefig(KEPT / f"{game}.png", dpi=110)
-
-
-if __name__ == "__main__":
-    sys.exit(cli.run(main))
+        draw_curves(groups, game, colours_of(groups)).savefig(directory / f"{game}.png", dpi=110)
