@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from foajax.config.parse import ConfigError, brief
+from foajax.config.parse import ConfigError, brief, one_line
 from foajax.config.schema import Config
 from foajax.types import Outcome, TimeStep
 
@@ -46,8 +46,7 @@ class GymnasiumEnvironment:
         try:
             self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
-            reason = " ".join(str(error).split())
-            raise ConfigError(f"game={config.game}: accepted is the id of an environment ({reason})") from None
+            raise ConfigError(f"game={config.game}: accepted is the id of an environment ({one_line(error)})") from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
         if not (is_pixels and isinstance(actions, spaces.Discrete)):

@@ -30,7 +30,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxlib import _jax
 
-from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, one_line, to_mapping
 from foajax.config.schema import Config, check_address, check_shares
 from foajax.launch import coordinator
 
@@ -143,7 +143,7 @@ def start(config: Config) -> Job:
                     **others, initialization_timeout=_STARTING, heartbeat_timeout_seconds=keepalive
                 )
         except (RuntimeError, ValueError) as error:
-            reason = " ".join(str(error).split())[:200]
+            reason = one_line(error)[:200]
             raise ConfigError(f"distributed={others}: accepted is what all processes can reach ({reason})") from None
     return Job(config)
 
@@ -261,7 +261,7 @@ class Watch:
             # Gloo's failures come as either, depending on the call that they come up in.
             if self._job.count == 1 or (isinstance(error, ValueError) and "Gloo" not in str(error)):
                 raise
-            self._end(" ".join(str(error).split())[:160])
+            self._end(one_line(error)[:160])
 
     def _watch(self) -> None:
         pause = min(1.0, self._timeout / 10)
@@ -282,7 +282,7 @@ class Watch:
             try:
                 left = self._rescue()
             except Exception as error:  # whatever it is, this process ends
-                left = f"nothing could be saved: {' '.join(str(error).split())}"
+                left = f"nothing could be saved: {one_line(error)}"
             said = f"{place}: another process died or hangs ({reason}); {left}"
             print(f"foajax: error: {said}", file=sys.stderr, flush=True)
         finally:

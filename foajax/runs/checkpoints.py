@@ -34,7 +34,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint._src.multihost import multihost
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, one_line
 from foajax.runs import durable
 
 _FORMAT = 1
@@ -348,7 +348,7 @@ def _score(path: Path) -> float:
 
 
 def _one_line(error: BaseException) -> str:
-    text = " ".join(str(error).split())
+    text = one_line(error)
     if not isinstance(error, CheckpointError | durable.DamageError | OSError):
         text = f"{type(error).__name__}: {text}"
     return text if len(text) <= 300 else f"{text[:145]} ... {text[-150:]}"  # a reason may be at either end

@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 
-from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, one_line, to_mapping
 from foajax.config.schema import Config, from_mapping
 from foajax.runs import durable
 from foajax.runs.lock import RunError, reason_of, take_lock
@@ -168,7 +168,7 @@ def failure(path: Path) -> str | None:
 
 def describe_error(error: Exception) -> str:
     """An error in one line: the text of what the user can mend, else its type as well."""
-    text = " ".join(str(error).split())
+    text = one_line(error)
     return text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}"
 
 

@@ -8,7 +8,7 @@ import socket
 import time
 from pathlib import Path
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, one_line
 
 
 class RunError(ConfigError):
@@ -61,5 +61,5 @@ def _lock(descriptor: int) -> None:
 
 def reason_of(error: Exception) -> str:
     """Why a file cannot be used, for the end of a line."""
-    text = getattr(error, "strerror", None) or " ".join(str(error).split())
+    text = getattr(error, "strerror", None) or one_line(error)
     return text if len(text) <= 200 else text[:197] + "..."

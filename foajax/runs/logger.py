@@ -23,6 +23,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 from jaxtyping import UInt8
 
+from foajax.config.parse import one_line
 from foajax.runs import durable
 from foajax.runs.display import Display
 from foajax.runs.durable import WholeFile
@@ -112,7 +113,7 @@ class Logger:
             now = time.monotonic()
             if now - self._warned.get(output, -math.inf) >= _WARN_EVERY:
                 self._warned[output] = now
-                reason = " ".join(str(error).split()) or type(error).__name__
+                reason = one_line(error) or type(error).__name__
                 self.message(f"warning: {output} cannot be written ({reason}); training goes on")
 
 

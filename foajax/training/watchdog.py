@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, one_line
 from foajax.config.schema import Config
 from foajax.launch.signals import signal_in
 from foajax.runs.agents import CHECKPOINTS
@@ -111,7 +111,7 @@ class Watchdog:
             except ConfigError:
                 raise
             except Exception as error:
-                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                reason = one_line(f"{type(error).__name__}: {error}")
                 raise EnvironmentFault(f"{what} raised {reason[:300]}") from error
             finally:
                 self._call = None
