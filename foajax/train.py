@@ -23,10 +23,10 @@ from foajax.checkpoint import Checkpoints
 from foajax.config import Config, ConfigError
 from foajax.distributed import Job, Watch
 from foajax.dump import Dump
-from foajax.learner import Metrics
+from foajax.learner import Metrics, explained_variance
 from foajax.logger import EpisodeTracker, Logger
 from foajax.programs import make_programs, make_state, use_compilation_cache
-from foajax.rollout import Collector, update_on
+from foajax.rollout import ROLLOUTS_TO_OBSERVE, Collector, update_on
 from foajax.rundir import RunDir, is_run, note_failure, open_run, take_over
 from foajax.sharding import Layout
 from foajax.snapshots import snapshots
@@ -89,6 +89,8 @@ class Run:
         self._watch = Watch(job, config.distributed.timeout, self._rescue)
         with self._watch.expecting_others():
             self._restore()
+        is_new = not self._env_steps and config.train.init_from is None
+        self._to_observe = ROLLOUTS_TO_OBSERVE if is_new else 0
         if run_dir is None or self._checkpoints is None:
             self._say = lambda text: None
             return
@@ -138,6 +140,7 @@ class Run:
         while self._env_steps < train.env_steps and not self._is_to_stop(stop):
             self._keep(compiled=bool(metrics))
             step = self._env_steps // self._config.env.num_envs
+            step -= self._to_observe * self._config.learner.rollout_length
             own, outcomes = self._collector.collect(self._nearby(self._state), step)
             outcomes, games = self._meet(outcomes, stop)
             # Fetched one rollout late: by now they are there, and nothing waits for the device.
@@ -149,11 +152,16 @@ class Run:
             if self._dump:
                 self._dump.remember(self._env_steps, self._state.params, own)
             rollouts = [self._layout.join(rollout) for rollout in own] if self._layout else own
+            self._track(outcomes)
+            if self._to_observe:
+                for rollout in rollouts:
+                    self._state = self._programs.observe(self._state, rollout)
+                self._to_observe -= 1
+                continue
             self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
             if now - pictured >= _PICTURES_EVERY:
                 self._picture(own[0])
                 pictured = now
-            self._track(outcomes)
             self._env_steps += self._rollout_steps
             self._games = games
             if now - saved >= train.checkpoint_every:
@@ -241,7 +249,7 @@ class Run:
                 "score": self._tracker.mean_score,
                 "length": self._tracker.mean_length,
                 "best_score": self._tracker.best_score,
-                **means,
+                **explained_variance(means),
                 "skipped_updates": rows[-1]["skipped_updates"],
             }
         )
