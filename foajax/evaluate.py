@@ -1,16 +1,22 @@
-"""`python -m foajax.evaluate run=<dir> episodes=30`: whole games, unclipped scores."""
+"""`python -m foajax.evaluate run=<dir>`: an agent's score in 100 whole games, unclipped.
+
+The games are those of the agent's training, with seeds of their own. `env.<key>=value` changes them, for another
+protocol: `env.sticky_actions=0.25`, `env.episodic_life=false` (the agent has to start each life itself),
+`env.max_episode_steps=4500`. A game that reaches the last of these, 27,000 decisions by default, is cut and counted.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
@@ -19,8 +25,13 @@ from foajax.config import ConfigError
 from foajax.envs import Environment, make
 from foajax.store import Stored, load_agent
 
-_FIRST_SEED = 1_000_003  # apart from the seeds of training
-_SEEDS = 2**31 - 2_000_000  # the engines take 32 bits, and add an environment's number
+_SEEDS = 2**31  # seeds to choose from
+_WATCHED = 1_000_003  # keeps what `np.random.SeedSequence` makes of them apart from the seeds of training
+# What may differ from training: the rest of `env` decides what a frame is.
+_PROTOCOL = (
+    *("engine", "frame_skip", "noop_max", "clip_rewards", "episodic_life", "fire_on_reset", "sticky_actions"),
+    *("max_episode_steps", "threads"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,11 +39,11 @@ class Options:
     """What the command takes."""
 
     run: str  # a run directory or a shipped agent
-    episodes: int = 30
+    episodes: int = 100
     policy: Literal["sampled", "greedy"] = "sampled"  # greedy games that begin alike are alike: 31 ways with no-ops
     checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     json: str | None = None  # file for the result
-    num_envs: int = 30  # games played at once
+    num_envs: int = 25  # games played at once
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -47,6 +58,7 @@ class Games(NamedTuple):
 
     returns: np.ndarray  # [episodes] unclipped
     lengths: np.ndarray  # [episodes] agent steps
+    cut: int  # how many of them reached `env.max_episode_steps`
 
 
 def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = False) -> Environment:
@@ -58,15 +70,25 @@ def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = Fals
     if not 0 <= seed < _SEEDS:
         raise ConfigError(f"seed={seed}: accepted is an integer from 0 to {_SEEDS - 1}")
     config, actions = stored.agent.config, stored.agent.num_actions
-    made = make(config, num_envs=num_envs, seed=_FIRST_SEED + seed, render=render)
+    # An engine adds an environment's number to its seed: neighbouring seeds may not lie side by side.
+    first = int(np.random.SeedSequence([_WATCHED, seed]).generate_state(1)[0] >> 2)
+    made = make(config, num_envs=num_envs, seed=first, render=render)
     if made.num_actions != actions:
         made.close()
         raise ConfigError(f"game={config.game}: has {made.num_actions} actions; accepted are {actions}, as in training")
     return made
 
 
-def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: bool) -> Games:
-    """Plays `episodes` games with fixed parameters.
+def play(
+    stored: Stored,
+    *,
+    episodes: int,
+    num_envs: int,
+    seed: int,
+    greedy: bool,
+    progress: Callable[[int], None] | None = None,
+) -> Games:
+    """Plays `episodes` games with fixed parameters; `progress` is told how many have ended, after each step.
 
     Every environment plays the same number of games, to within one, so that short games are not over-represented.
     """
@@ -77,7 +99,7 @@ def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: boo
     state = stored.agent.initial_state(num_envs)
     key = jax.random.key(seed)
     returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
-    finished: list[tuple[float, int]] = []
+    finished: list[tuple[float, int, bool]] = []
     timestep, _ = watched.reset()
     step = 0
     while len(finished) < episodes:
@@ -86,28 +108,37 @@ def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: boo
         timestep, outcome = watched.recv()
         returns += outcome.score
         lengths += 1 - timestep.is_first
+        most = stored.agent.config.env.max_episode_steps
         for i in np.flatnonzero(outcome.is_over):
             if games[i] < rounds[i]:
-                finished.append((float(returns[i]), int(lengths[i])))
+                finished.append((float(returns[i]), int(lengths[i]), bool(lengths[i] >= most)))
             games[i] += 1
             returns[i], lengths[i] = 0, 0
         step += 1
+        if progress is not None:
+            progress(len(finished))
     watched.close()
-    return Games(returns=np.array([r for r, _ in finished]), lengths=np.array([n for _, n in finished]))
+    scores, steps, cut = map(np.array, zip(*finished, strict=True))
+    return Games(returns=scores, lengths=steps, cut=int(cut.sum()))
 
 
 def evaluate(arguments: Sequence[str]) -> None:
     """The command."""
-    options = cli.parse(Options, arguments)
+    protocol = [word for word in arguments if word.startswith("env.")]
+    options = cli.parse(Options, [word for word in arguments if word not in protocol])
     stored = load_agent(options.run, best=options.checkpoint == "best")
-    config = stored.agent.config
-    games = play(
-        stored,
-        episodes=options.episodes,
-        num_envs=options.num_envs,
-        seed=options.seed,
-        greedy=options.policy == "greedy",
-    )
+    env = cli.override(stored.agent.config.env, protocol, "env", _PROTOCOL)
+    config = dataclasses.replace(stored.agent.config, env=env)
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("games", total=options.episodes)
+        games = play(
+            stored._replace(agent=dataclasses.replace(stored.agent, config=config)),
+            episodes=options.episodes,
+            num_envs=options.num_envs,
+            seed=options.seed,
+            greedy=options.policy == "greedy",
+            progress=lambda ended: bar.update(task, completed=ended),
+        )
     result = {
         "run": options.run,
         "game": config.game,
@@ -115,9 +146,11 @@ def evaluate(arguments: Sequence[str]) -> None:
         "env_steps": stored.env_steps,
         "policy": options.policy,
         "seed": options.seed,
+        "protocol": protocol,
         "episodes": options.episodes,
         "mean": float(games.returns.mean()),
         "stderr": standard_error(games.returns),
+        "cut": games.cut,
         "returns": games.returns.tolist(),
         "lengths": games.lengths.tolist(),
     }
@@ -147,7 +180,10 @@ def _print(result: dict) -> None:
         f"{returns.max():.0f}",
         f"{np.mean(result['lengths']):.0f}",
     )
-    Console(width=120).print(table)
+    console = Console(width=120)
+    console.print(table)
+    if result["cut"]:
+        console.print(f"{result['cut']} of them were cut at env.max_episode_steps")
 
 
 if __name__ == "__main__":
