@@ -11,11 +11,11 @@ import sys
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import yaml
 
-from foajax.config.parse import ConfigError, build, describe
+from foajax.config.parse import ConfigError, build, describe, to_mapping
 
 Options = TypeVar("Options")
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it
@@ -24,15 +24,32 @@ _CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EI
 
 def parse(options: type[Options], arguments: Sequence[str]) -> Options:
     """Builds `options` from `key=value` words, values read as YAML; raises `ConfigError`."""
+    return build(options, _values(arguments, options, ""), "")
+
+
+def override(config: Options, arguments: Sequence[str], prefix: str, keys: Sequence[str]) -> Options:
+    """`config`, a part of a run's, with the values of `<prefix>.key=value` words for some of its `keys`.
+
+    Raises:
+      ConfigError: another key, or a value that it does not accept.
+    """
+    values = _values([word.removeprefix(f"{prefix}.") for word in arguments], type(config), f"{prefix}.")
+    for key, value in values.items():
+        if key not in keys:
+            raise ConfigError(f"{prefix}.{key}={value}: accepted of {prefix} are {', '.join(keys)}")
+    return build(type(config), to_mapping(config) | values, prefix)
+
+
+def _values(arguments: Sequence[str], cls: Any, prefix: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    hints = typing.get_type_hints(options)
+    hints = typing.get_type_hints(cls)
     for word in arguments:
         key, separator, text = word.partition("=")
         if not separator:
-            names = ", ".join(field.name for field in dataclasses.fields(cast(Any, options)))
-            raise ConfigError(f"{word}: accepted is key=value with one of {names}")
-        values[key] = _value(key, text, hints.get(key))
-    return build(options, values, "")
+            names = ", ".join(prefix + field.name for field in dataclasses.fields(cls))
+            raise ConfigError(f"{prefix}{word}: accepted is key=value with one of {names}")
+        values[key] = _value(prefix + key, text, hints.get(key))
+    return values
 
 
 def _value(key: str, text: str, hint: Any) -> Any:

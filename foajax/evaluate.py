@@ -1,4 +1,9 @@
-"""`python -m foajax.evaluate run=<dir> episodes=30`: whole games, unclipped scores."""
+"""`python -m foajax.evaluate run=<dir>`: an agent's score in 100 whole games, unclipped.
+
+The games are those of the agent's training, with seeds of their own. `env.<key>=value` changes them, for another
+protocol: `env.sticky_actions=0.25`, `env.episodic_life=false` (the agent has to start each life itself),
+`env.max_episode_steps=4500`. A game that reaches the last of these, 27,000 decisions by default, is cut and counted.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
@@ -17,17 +23,23 @@ from foajax.config.parse import ConfigError
 from foajax.runs.agents import load_agent
 from foajax.viewing.games import play
 
+# What may differ from training: the rest of `env` decides what a frame is.
+_PROTOCOL = (
+    *("engine", "frame_skip", "noop_max", "clip_rewards", "episodic_life", "fire_on_reset", "sticky_actions"),
+    *("max_episode_steps", "threads"),
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What the command takes."""
 
     run: str  # a run directory or a shipped agent
-    episodes: int = 30
+    episodes: int = 100
     policy: Literal["sampled", "greedy"] = "sampled"  # greedy games that begin alike are alike: 31 ways with no-ops
     checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     json: str | None = None  # file for the result
-    num_envs: int = 30  # games played at once
+    num_envs: int = 25  # games played at once
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -39,16 +51,21 @@ class Options:
 
 def evaluate(arguments: Sequence[str]) -> None:
     """The command."""
-    options = cli.parse(Options, arguments)
+    protocol = [word for word in arguments if word.startswith("env.")]
+    options = cli.parse(Options, [word for word in arguments if word not in protocol])
     stored = load_agent(options.run, best=options.checkpoint == "best")
-    config = stored.agent.config
-    games = play(
-        stored,
-        episodes=options.episodes,
-        num_envs=options.num_envs,
-        seed=options.seed,
-        greedy=options.policy == "greedy",
-    )
+    env = cli.override(stored.agent.config.env, protocol, "env", _PROTOCOL)
+    config = dataclasses.replace(stored.agent.config, env=env)
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("games", total=options.episodes)
+        games = play(
+            stored._replace(agent=dataclasses.replace(stored.agent, config=config)),
+            episodes=options.episodes,
+            num_envs=options.num_envs,
+            seed=options.seed,
+            greedy=options.policy == "greedy",
+            progress=lambda ended: bar.update(task, completed=ended),
+        )
     result = {
         "run": options.run,
         "game": config.game,
@@ -56,9 +73,11 @@ def evaluate(arguments: Sequence[str]) -> None:
         "env_steps": stored.env_steps,
         "policy": options.policy,
         "seed": options.seed,
+        "protocol": protocol,
         "episodes": options.episodes,
         "mean": float(games.returns.mean()),
         "stderr": standard_error(games.returns),
+        "cut": games.cut,
         "returns": games.returns.tolist(),
         "lengths": games.lengths.tolist(),
     }
@@ -88,7 +107,10 @@ def _print(result: dict) -> None:
         f"{returns.max():.0f}",
         f"{np.mean(result['lengths']):.0f}",
     )
-    Console(width=120).print(table)
+    console = Console(width=120)
+    console.print(table)
+    if result["cut"]:
+        console.print(f"{result['cut']} of them were cut at env.max_episode_steps")
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ class ActorState(NamedTuple):
     core_state: CoreState
     focal_point: Int[Array, "B 2"]  # (y, x) in frame pixels, used to sense the next frame
     age: Int[Array, "B"]  # steps since the episode began, for a scripted gaze
+    last_actions: Int[Array, "B 2"] | None = None  # natural, visual; None where the network is not told
 
 
 class NetworkOutput(NamedTuple):
@@ -69,6 +70,7 @@ class ActorOutput(NamedTuple):
     reward: Float[Array, "B"]  # of the time step acted on
     is_first: Bool[Array, "B"]
     is_terminal: Bool[Array, "B"]
+    last_actions: Int[Array, "B 2"] | None  # natural and visual action of the step before, as the network was told
     # Mean and deviation of the frames before normalisation, for the running statistics: averages over the batch, or
     # over each device's part of it.
     frames: tuple[Float[Array, "1 ..."], ...]

@@ -164,6 +164,7 @@ def test_network_choices():
         "network.lstm=512",
         "network.focal_point=packed",
         "network.lstm_norm=false",
+        *("network.last_actions=false", "network.last_reward=false", "network.forget_bias=0"),
     ]
     words.append("network.normalization=running")
     assert compose(["network=a3c"]).network == compose(words).network

@@ -122,7 +122,7 @@ def test_agents_are_beside_a_checkout():
     ("word", "said"),
     [
         ("json=nowhere/score.json", "json=nowhere/score.json: accepted is a file, to write, in a directory that"),
-        ("seed=2147483647", "seed=2147483647: accepted is an integer from 0 to"),
+        ("seed=2147483648", "seed=2147483648: accepted is an integer from 0 to"),
         ("seed=-1", "seed=-1: accepted is an integer from 0 to"),
         ("checkpoint=last", "checkpoint=last: accepted is one of newest, best"),
         ("run=2026-13-01", "run=2026-13-01: does not exist"),  # text, though it looks like a date

@@ -1,5 +1,6 @@
 """Returns and advantages against the paper's sums, per stretch, on every short rollout there is."""
 
+import functools
 import itertools
 
 import jax
@@ -154,7 +155,7 @@ def test_natural_head_on_every_rollout(streams, batched):
 def test_vision_head_on_every_rollout(streams, batched):
     consistent, literal, advantage, loss_mask = oracle(vision_oracle, streams)
     stream = batched(returns.vision_stream)(*arguments(streams, "r", "is_terminal", "mask"))
-    np.testing.assert_array_equal(stream.loss_mask_t, loss_mask)
+    np.testing.assert_array_equal(stream.value_mask_t, loss_mask)
 
     actual = batched(vision_advantages_with(LAMBDA))(*arguments(streams, *VISION))
     np.testing.assert_allclose(actual * stream.mask_t, advantage * stream.mask_t, atol=1e-5)
@@ -195,7 +196,7 @@ def test_gamma_zero_leaves_each_head_its_own_reward(streams, batched):
     stream = batched(returns.vision_stream)(r, is_terminal, mask)
     actual = batched(vision_returns_with("consistent"))(r, none, is_terminal, mask, v_t)
     follows = mask[:, :-1] * mask[:, 1:] * ~is_terminal[:, :-1]
-    np.testing.assert_allclose((actual * stream.loss_mask_t)[:, :-1], follows * r[:, 1:])
+    np.testing.assert_allclose((actual * stream.value_mask_t)[:, :-1], follows * r[:, 1:])
 
 
 def test_nothing_crosses_the_end_of_an_episode():
@@ -292,7 +293,7 @@ def test_vision_reward_of_the_next_episode_is_not_credited(bootstrap):
     np.testing.assert_array_equal(hand_vision(stream, bootstrap)[:2], [2, 0])
     shifted = returns.vision_stream(stream["r"], stream["is_terminal"], stream["mask"])
     np.testing.assert_array_equal(shifted.r_t, [2, 0, 8, 0])
-    np.testing.assert_array_equal(shifted.loss_mask_t, [1, 1, 0, 0])
+    np.testing.assert_array_equal(shifted.value_mask_t, [1, 1, 0, 0])
 
 
 def test_vision_return_of_a_truncated_episode_by_hand():
@@ -301,10 +302,22 @@ def test_vision_return_of_a_truncated_episode_by_hand():
     assert hand_vision(stream, "consistent")[0] == 2 + 0.5 * 17
     np.testing.assert_array_equal(hand_vision(stream, "literal")[:2], [2 + 0.5 * 9, 9])
     shifted = returns.vision_stream(stream["r"], stream["is_terminal"], stream["mask"])
-    np.testing.assert_array_equal(shifted.loss_mask_t, [1, 0, 0, 0])
+    np.testing.assert_array_equal(shifted.value_mask_t, [1, 0, 0, 0])
+
+
+def test_no_frame_follows_the_visual_action_before_an_end(streams):
+    r, is_terminal, mask = arguments(streams, "r", "is_terminal", "mask")
+    every, useful = (
+        jax.vmap(functools.partial(returns.vision_stream, credits_last=last))(r, is_terminal, mask)
+        for last in (True, False)
+    )
+    np.testing.assert_array_equal(every.policy_mask_t, every.value_mask_t)
+    np.testing.assert_array_equal(useful.value_mask_t, every.value_mask_t)
+    np.testing.assert_array_equal(useful.policy_mask_t, every.value_mask_t * ~is_terminal)
+    assert (useful.policy_mask_t != every.policy_mask_t).any()
 
 
 def test_last_visual_action_gets_no_gradient(streams):
     stream = jax.vmap(returns.vision_stream)(*arguments(streams, "r", "is_terminal", "mask"))
-    assert not np.asarray(stream.loss_mask_t)[:, -1].any()
-    assert np.asarray(stream.loss_mask_t)[:, :-1].any(axis=0).all()
+    assert not np.asarray(stream.value_mask_t)[:, -1].any()
+    assert np.asarray(stream.value_mask_t)[:, :-1].any(axis=0).all()

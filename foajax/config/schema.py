@@ -143,15 +143,23 @@ class NetworkConfig:
 
     torso: Literal["nature", "a3c"] = "nature"
     dense: int = 256  # units between torso and LSTM; 0 for none
+    dense_norm: bool = False  # layer norm of what enters these units
     lstm: int = 256
     padding: Literal["cover", "valid"] = "cover"  # valid: the nature torso leaves out what its strides do not fit
     focal_point: Literal["always", "packed"] = "always"  # which gaze tells the LSTM where it is; packed: no canvas's
+    focal_scale: Literal["reach", "frame"] = (
+        "reach"  # of that point: -1 and 1 are the ends of its reach, or of the frame
+    )
+    last_actions: bool = True  # the LSTM is told both actions of the step before
+    last_reward: bool = True  # and the reward that followed
+    forget_bias: float = 1.0  # of the LSTM's forget gates, before learning
     lstm_norm: bool = True  # layer norm of the input's part of the LSTM's gates
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 
     def __post_init__(self) -> None:
         check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
         check(1 <= self.lstm <= 16_384, "network.lstm", self.lstm, "an integer from 1 to 16384")
+        check(abs(self.forget_bias) <= 100, "network.forget_bias", self.forget_bias, "a number from -100 to 100")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +188,7 @@ class LearnerConfig:
     learning_rate: float = 1e-3
     full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
     warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
-    schedule: Literal["constant", "linear"] = "constant"  # linear falls to 0 at train.env_steps, skipped updates apart
+    schedule: Literal["constant", "linear"] = "linear"  # linear falls to 0 at train.env_steps, skipped updates apart
     amsgrad: bool = False  # divide by the largest second moment so far, in place of Adam's latest
     adam_b1: float = 0.9
     adam_b2: float = 0.999
@@ -192,6 +200,7 @@ class LearnerConfig:
     vision_weight: float = 0.25  # of both of the vision head's losses
     value_target: Literal["n_step", "lambda"] = "lambda"  # to the rollout's end, or mixed as the advantages are
     vision_bootstrap: Literal["consistent", "literal"] = "consistent"  # of the vision head's n-step returns
+    credits_last_gaze: bool = True  # a policy gradient for the visual action before an end, which nothing follows
     natural: HeadConfig = HeadConfig()
     vision: HeadConfig = HeadConfig()
 

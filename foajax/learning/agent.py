@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, UInt8
 
-from foajax.config.schema import Config
+from foajax.config.schema import Config, RingSensor
 from foajax.learning.losses import log_prob
 from foajax.networks import network as networks
 from foajax.sensors import frames, gaze
@@ -44,8 +44,9 @@ class Agent:
 
     def initial_params(self, key: PRNGKeyArray) -> Params:
         """Parameters before any learning."""
+        side = self.side(jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2), jnp.int32), jnp.zeros(1), jnp.zeros(1, bool))
         shapes = image_shapes(self.config.sensor, self.config.env.frame_shape)
-        return networks.initial_params(self.network, key, shapes)
+        return networks.initial_params(self.network, key, shapes, side.shape[-1])
 
     def initial_statistics(self) -> FrameStatistics:
         """Frame statistics before any frame."""
@@ -57,6 +58,7 @@ class Agent:
             core_state=networks.initial_core_state(self.network, batch),
             focal_point=jnp.zeros((batch, 2), jnp.int32),
             age=jnp.zeros((batch,), jnp.int32),
+            last_actions=jnp.zeros((batch, 2), jnp.int32) if self.config.network.last_actions else None,
         )
 
     def act(
@@ -86,8 +88,9 @@ class Agent:
         focal_point, age = self.look(start_key, state, timestep)
         roi = self.sense(frame, focal_point)
         images = [image[None] for image in roi]
-        unit, is_first = self.unit(focal_point)[None], timestep.is_first[None]
-        output, core_state = self.forward(params, images, unit, is_first, state.core_state)
+        reward, is_first = jnp.asarray(timestep.reward), jnp.asarray(timestep.is_first)
+        side = self.side(focal_point, state.last_actions, reward, is_first)
+        output, core_state = self.forward(params, images, side[None], is_first[None], state.core_state)
         output = jax.tree.map(lambda x: x[0], output)
         natural_action = _choose(natural_key, output.natural_logits, greedy)
         vision_action, vision_log_prob = self.choose_vision(vision_key, output, greedy)
@@ -98,21 +101,26 @@ class Agent:
             vision_action=vision_action,
             natural_log_prob=log_prob(output.natural_logits, natural_action),
             vision_log_prob=vision_log_prob,
-            reward=jnp.asarray(timestep.reward),
-            is_first=jnp.asarray(timestep.is_first),
+            reward=reward,
+            is_first=is_first,
             is_terminal=jnp.asarray(timestep.is_terminal),
+            last_actions=state.last_actions,
             frames=(jnp.mean(frame_mean, axis=0, keepdims=True), jnp.mean(frame_std, keepdims=True)),
         )
+        told = state.last_actions is not None
         state = ActorState(
-            core_state=core_state, focal_point=self.move(focal_point, vision_action, age + 1), age=age + 1
+            core_state=core_state,
+            focal_point=self.move(focal_point, vision_action, age + 1),
+            age=age + 1,
+            last_actions=jnp.stack([natural_action, vision_action], axis=-1) if told else None,
         )
         return actor_output, output, state
 
     def unroll(self, params: Params, rollout: Rollout) -> NetworkOutput:
         """The network over a whole rollout; each output [T+1, B, ...]."""
         steps = rollout.steps
-        unit = self.unit(steps.focal_point)
-        return self.forward(params, list(steps.roi), unit, steps.is_first, rollout.core_state)[0]
+        side = self.side(steps.focal_point, steps.last_actions, steps.reward, steps.is_first)
+        return self.forward(params, list(steps.roi), side, steps.is_first, rollout.core_state)[0]
 
     def forward(self, params: Params, *inputs: Any) -> tuple[NetworkOutput, CoreState]:
         """The network over T steps; `inputs` are those of `networks.Network`."""
@@ -161,9 +169,43 @@ class Agent:
         look = functools.partial(sense, sensor=self.config.sensor, bounds=self.config.gaze.bounds)
         return jax.vmap(look)(frame, focal_point)
 
-    def unit(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """Focal points in [-1, 1)."""
-        return gaze.to_unit(focal_point, self.config.env.frame_shape)
+    def side(
+        self,
+        focal_point: Int[Array, "... 2"],
+        last_actions: Int[Array, "... 2"] | None,
+        reward: Float[Array, "..."],
+        is_first: Bool[Array, "..."],
+    ) -> Float[Array, "... S"]:
+        """What the LSTM is told beside the images, as configured; S may be 0.
+
+        The focal point; then, of the step before, the natural and the visual action as one-hot vectors and the reward
+        that is learned from, all 0 where an episode starts.
+        """
+        parts = [jnp.zeros((*reward.shape, 0))]
+        network = self.config.network
+        if self._sees_focal_point:
+            parts.append(self._scaled(focal_point))
+        going_on = (1.0 - is_first.astype(jnp.float32))[..., None]
+        if network.last_actions and last_actions is not None:
+            counts = (self.num_actions, self.network.num_vision_actions)
+            parts += [going_on * jax.nn.one_hot(last_actions[..., i], n) for i, n in enumerate(counts)]
+        if network.last_reward:
+            parts.append(going_on * reward[..., None])
+        return jnp.concatenate(parts, axis=-1)
+
+    def _scaled(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """Focal points in [-1, 1] of where they can be or, as older agents have them, of the frame."""
+        if self.config.network.focal_scale == "frame":
+            return gaze.to_unit(focal_point, self.config.env.frame_shape)
+        return gaze.to_reach(focal_point, **self._gaze)
+
+    @property
+    def _sees_focal_point(self) -> bool:
+        # A packed image does not tell where it was taken. Nor does a canvas whose normalisation makes 0 of what never
+        # changes, as of what is outside: between two rows of Breakout's empty middle it is the same.
+        sensor = self.config.sensor
+        canvas = isinstance(sensor, RingSensor) and sensor.layout == "canvas"
+        return not canvas or (self.config.network.focal_point == "always" and self.config.gaze.mode != "none")
 
     @property
     def _by_pixel(self) -> bool:

@@ -72,7 +72,8 @@ def loss(
     heads = [_natural_targets(config.natural, *transitions, output.natural_value)]
     if output.vision_value is not None:
         heads.append(_vision_targets(config, *transitions, output.vision_value))
-    valid = _whole(jnp.stack([losses.valid_steps(targets.mask_t) for targets in heads]), axis)
+    masks = [(targets.policy_mask_t, targets.value_mask_t) for targets in heads]
+    valid = _whole(jnp.stack([jnp.stack([losses.valid_steps(mask) for mask in pair]) for pair in masks]), axis)
     total, metrics = _head_loss(
         config,
         config.natural,
@@ -107,7 +108,8 @@ class Targets(NamedTuple):
 
     returns: Float[Array, "T B"]  # n-step
     advantages: Float[Array, "T B"]
-    mask_t: Float[Array, "T B"]  # 1 where the step enters the loss
+    policy_mask_t: Float[Array, "T B"]  # 1 where the step enters the policy's loss
+    value_mask_t: Float[Array, "T B"]  # and the value's
 
 
 def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
@@ -116,7 +118,8 @@ def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t:
         return Targets(
             returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
             advantages=returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda),
-            mask_t=mask_t,
+            policy_mask_t=mask_t,
+            value_mask_t=mask_t,
         )
 
     return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
@@ -127,10 +130,12 @@ def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mas
 
     def one(r_t, is_terminal_t, mask_t, v):
         stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
+        credited = returns.vision_stream(r_t, is_terminal_t, mask_t, credits_last=config.credits_last_gaze)
         return Targets(
             returns=returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap),
             advantages=returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda),
-            mask_t=returns.vision_stream(r_t, is_terminal_t, mask_t).loss_mask_t,
+            policy_mask_t=credited.policy_mask_t,
+            value_mask_t=credited.value_mask_t,
         )
 
     return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
@@ -140,7 +145,7 @@ def _head_loss(
     config: LearnerConfig,
     head: HeadConfig,
     targets: Targets,
-    valid: Int[Array, ""],
+    valid: Int[Array, "2"],
     *,
     logits: Float[Array, "T B A"],
     value: Float[Array, "T B"],
@@ -150,11 +155,14 @@ def _head_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """One head's policy, value and entropy terms; the only place where they are masked, reduced and weighted.
 
-    `valid` counts the steps that enter, on all devices.
+    `valid` counts the steps that enter the policy's and the value's loss, on all devices.
     """
     shards = jax.lax.axis_size(axis) if axis else 1
-    reduce = functools.partial(losses.reduce_steps, mask_t=targets.mask_t, steps=valid, shards=shards)
-    mean = functools.partial(reduce, reduction="mean")
+    acts, values = (
+        functools.partial(losses.reduce_steps, mask_t=mask, steps=steps, shards=shards)
+        for mask, steps in zip((targets.policy_mask_t, targets.value_mask_t), valid, strict=True)
+    )
+    mean, mean_of_values = (functools.partial(reduce, reduction="mean") for reduce in (acts, values))
     advantages = targets.advantages
     target = targets.returns if config.value_target == "n_step" else value + advantages
     if config.normalize_advantages:
@@ -165,10 +173,22 @@ def _head_loss(
     )
     error = losses.value_loss(value, target)
     entropy = losses.entropy(logits)
-    total = policy - head.beta * entropy + config.value_weight * error
-    metrics = {"policy_loss": mean(policy), "value_loss": mean(error), "entropy": mean(entropy), "value": mean(value)}
-    metrics["policy"] = jax.vmap(mean, in_axes=-1)(jax.nn.softmax(logits))
-    return reduce(total, reduction=config.reduction), metrics
+    total = acts(policy - head.beta * entropy, reduction=config.reduction)
+    total += config.value_weight * values(error, reduction=config.reduction)
+    log_ratio = losses.log_prob(logits, action) - behaviour_log_prob
+    metrics = {
+        "policy_loss": mean(policy),
+        "value_loss": mean_of_values(error),
+        "entropy": mean(entropy),
+        "value": mean_of_values(value),
+        "approx_kl": mean(jnp.expm1(log_ratio) - log_ratio),  # of the policy that acted from today's (Schulman 2020)
+        "policy": jax.vmap(mean, in_axes=-1)(jax.nn.softmax(logits)),
+        "moments": jax.vmap(mean_of_values)(jnp.stack([target, target**2, target - value, (target - value) ** 2])),
+    }
+    if config.clip_ratio is not None:
+        outside = jnp.abs(jnp.expm1(log_ratio)) > config.clip_ratio
+        metrics["clip_fraction"] = mean(outside.astype(jnp.float32))
+    return total, metrics
 
 
 def _whole(parts: Any, axis: str | None) -> Any:
@@ -179,17 +199,49 @@ def _whole(parts: Any, axis: str | None) -> Any:
     return restore(jax.lax.psum(flat, axis))
 
 
-def _with_information(metrics: Metrics) -> Metrics:
-    """Each head's mean `policy` replaced by `information`: what its decisions tell of what was seen, in nats.
+def _summed_up(metrics: Metrics) -> Metrics:
+    """What only the whole minibatch's means tell, in the place of those means.
 
-    The entropy of the mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
+    `information`, of each head's mean `policy`: what its decisions tell of what was seen, in nats. The entropy of the
+    mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
+
+    `target_variance` and `error_variance`, of the `moments`: see `explained_variance`.
     """
     kept = dict(metrics)
     # In the mapping's order: in a set's, which no two processes share, they would compile different programs.
-    for name in [name for name in metrics if name.endswith("_policy")]:
-        head, p = name.removesuffix("_policy"), kept.pop(name)
+    for head in [name.removesuffix("_policy") for name in metrics if name.endswith("_policy")]:
+        p, moments = kept.pop(f"{head}_policy"), kept.pop(f"{head}_moments")
         kept[f"{head}_information"] = jnp.sum(jnp.where(p > 0, -p * jnp.log(p), 0.0)) - metrics[f"{head}_entropy"]
+        kept[f"{head}_target_variance"] = moments[1] - moments[0] ** 2
+        kept[f"{head}_error_variance"] = moments[3] - moments[2] ** 2
     return kept
+
+
+def explained_variance(means: dict[str, float]) -> dict[str, float]:
+    """Updates' mean metrics with each head's 1 - Var(target - value) / Var(target), 1 at best, for both variances.
+
+    Of the means, because a minibatch without any reward has targets that hardly differ.
+    """
+    kept = dict(means)
+    for head in [name.removesuffix("_error_variance") for name in means if name.endswith("_error_variance")]:
+        errors, targets = kept.pop(f"{head}_error_variance"), kept.pop(f"{head}_target_variance")
+        kept[f"{head}_explained_variance"] = 1.0 - errors / max(targets, 1e-12)
+    return kept
+
+
+def observe(state: TrainState, rollout: Rollout, *, axis: str | None = None) -> TrainState:
+    """Takes a rollout's frames into the running statistics and learns nothing.
+
+    The deviation begins anew: what was measured from means that were not known yet is forgotten.
+    """
+    count = rollout.steps.is_first[:-1].size
+    frame_mean, frame_std = (jnp.mean(x[:-1], (0, 1)) for x in rollout.steps.frames)
+    if axis:
+        shards = jax.lax.axis_size(axis)
+        frame_mean, frame_std = _whole((frame_mean / shards, frame_std / shards), axis)
+        count *= shards
+    statistics = frames.update_statistics(state.statistics, frame_mean, frame_std, count)
+    return state._replace(statistics=statistics._replace(std=frame_std * statistics.weight))
 
 
 def update(
@@ -222,7 +274,7 @@ def update(
         results, frame_mean, frame_std = _whole((results, frame_mean / shards, frame_std / shards), axis)
         frames_seen *= shards
     gradient, metrics = results
-    metrics = _with_information(metrics)
+    metrics = _summed_up(metrics)
     grad_norm = optax.tree.norm(gradient)
     accept = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
     change, opt_state = optimizer.update(gradient, state.opt_state, state.params, accept=accept)

@@ -1,10 +1,10 @@
-"""The two compiled programs of training, made in one place."""
+"""The compiled programs of training, made in one place: `act` and `update`, and a small one that only observes."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +23,13 @@ class Programs(NamedTuple):
 
     act: Callable[..., tuple[Array, ActorState, Rollout]]
     update: Callable[..., tuple[TrainState, learner.Metrics]]
+    observe: Callable[..., TrainState]  # before the first update
     shards: int = 1  # devices of this process that share a rollout
 
 
 def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
-    """`act` records a decision in the rollout's buffer (donated); `update` applies one minibatch (state donated).
+    """`act` records a decision in the rollout's buffer (donated); `update` applies one minibatch (state donated);
+    `observe` takes a rollout's frames into the statistics (state donated).
 
     With a `layout` they are the same programs on each device's share of the environments.
     """
@@ -37,18 +39,24 @@ def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
     act = functools.partial(_act, agent)
     if layout is None:
         update = functools.partial(learner.update, agent, optimizer, size)
-        return Programs(act=jax.jit(act, donate_argnames="rollout"), update=jax.jit(update, donate_argnames="state"))
+        return Programs(
+            act=jax.jit(act, donate_argnames="rollout"),
+            update=jax.jit(update, donate_argnames="state"),
+            observe=jax.jit(learner.observe, donate_argnames="state"),
+        )
     update = functools.partial(learner.update, agent, optimizer, size // layout.job.size, axis=DATA)
+    observe = functools.partial(learner.observe, axis=DATA)
     acting = (EVERYWHERE, BATCH, BATCH, ROLLOUT, EVERYWHERE, BATCH, EVERYWHERE)
     updating = (EVERYWHERE, ROLLOUT, EVERYWHERE, EVERYWHERE)
     return Programs(
         act=_on(layout.local, act, acting, (BATCH, BATCH, ROLLOUT), donate=3),
         update=_on(layout.job, update, updating, (EVERYWHERE, EVERYWHERE), donate=0),
+        observe=_on(layout.job, observe, (EVERYWHERE, ROLLOUT), EVERYWHERE, donate=0),
         shards=layout.local.size,
     )
 
 
-def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: tuple, *, donate: int) -> Callable:
+def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, *, donate: int) -> Callable:
     """`program` on each device of a mesh, compiled; arrays from the host go to the devices that need them."""
     spread = jax.shard_map(program, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
     shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), inputs)

@@ -71,13 +71,16 @@ class VisionStream(NamedTuple):
 
     r_t: Float[Array, " T"]  # r'_j, the reward one transition later
     mask_t: Float[Array, " T"]  # 1 where r'_j is known: what its chains run over
-    loss_mask_t: Float[Array, " T"]  # 1 where the visual action gets a gradient
+    value_mask_t: Float[Array, " T"]  # 1 where the value is learned from it
+    policy_mask_t: Float[Array, " T"]  # 1 where the policy is
 
 
 def vision_stream(
     r_t: Float[Array, " T"],
     is_terminal_t: Bool[Array, " T"],
     mask_t: Float[Array, " T"],
+    *,
+    credits_last: bool = True,
 ) -> VisionStream:
     """Credits each visual action with the next reward: it moves the gaze that the *next* action is based on.
 
@@ -85,19 +88,23 @@ def vision_stream(
 
         r'_j = r_t[j+1]  (R_{j+2})  if s_{j+1} is not terminal, j+1 < T and mask_t[j+1];  else 0
         known: s_{j+1} is terminal (nothing follows: r'_j is 0), or j+1 < T and mask_t[j+1]
-        mask_t[j]  of the result = mask_t[j] and known;  loss_mask_t is the same, but 0 at j = T-1
+        mask_t[j]  of the result = mask_t[j] and known;  value_mask_t is the same, but 0 at j = T-1;
+        policy_mask_t too, and 0 where s_{j+1} is terminal unless `credits_last`
 
     The reward of the last visual action before a cut, be it the rollout's end or a truncation, is unknown and
     the action gets no gradient (the paper's sums end at k-2). Where s_T is terminal the reward is known to be
-    0, which the chains use; that action gets no gradient either.
+    0, which the chains use; that action gets no gradient either. No frame is seen after a terminal state, so the
+    visual action before it cannot matter: `credits_last` learns from it all the same, which adds noise alone.
     """
     next_is_real_t = jnp.append(mask_t[1:], 0.0)
     not_terminal_t = 1.0 - is_terminal_t.astype(mask_t.dtype)
     known_t = mask_t * jnp.where(is_terminal_t, 1.0, next_is_real_t)
+    value_mask_t = known_t.at[-1].set(0.0)
     return VisionStream(
         r_t=jnp.append(r_t[1:], 0.0) * next_is_real_t * not_terminal_t,
         mask_t=known_t,
-        loss_mask_t=known_t.at[-1].set(0.0),
+        value_mask_t=value_mask_t,
+        policy_mask_t=value_mask_t if credits_last else value_mask_t * not_terminal_t,
     )
 
 
@@ -110,7 +117,7 @@ def vision_returns(
     *,
     bootstrap: Literal["consistent", "literal"],
 ) -> Float[Array, " T"]:
-    """The vision head's return from each s_j, the target of its value loss where `loss_mask_t` is 1.
+    """The vision head's return from each s_j, the target of its value loss where `value_mask_t` is 1.
 
     With r' of `vision_stream`, for each stretch of k transitions s_0 .. s_k up to a cut, j = k-2 .. 0:
 

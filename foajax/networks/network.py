@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from foajax.config.schema import Config, NetworkConfig, RingSensor
+from foajax.config.schema import Config, NetworkConfig
 from foajax.networks.convolution import convolve, max_pool
 from foajax.networks.lstm import lstm
 from foajax.types import CoreState, NetworkOutput, Params
@@ -95,26 +96,29 @@ class Network(nn.Module):
     config: NetworkConfig
     num_natural_actions: int
     num_vision_actions: int  # 0: no vision head (non-FoA, and gaze that is not learned)
-    sees_focal_point: bool
 
     @nn.compact
     def __call__(
         self,
         roi: Sequence[Float[Array, "T B _ _ _"]],
-        focal_point: Float[Array, "T B 2"],
+        side: Float[Array, "T B S"],
         is_first: Bool[Array, "T B"],
         core_state: CoreState,
     ) -> tuple[NetworkOutput, CoreState]:
-        """`focal_point` in unit coordinates, [-1, 1). Each output is [T, B, ...]."""
+        """`side` is what the LSTM is told beside the images, S numbers or none. Each output is [T, B, ...]."""
         steps, batch = is_first.shape
         features = self.features([image.reshape(steps * batch, *image.shape[2:]) for image in roi])
-        if self.sees_focal_point:
-            features = jnp.concatenate([features, focal_point.reshape(steps * batch, 2)], axis=-1)
-        width = self.config.lstm
-        projected = nn.Dense(4 * width, kernel_init=nn.initializers.orthogonal(1.0), name="lstm_input")(features)
-        if self.config.lstm_norm:
+        features = jnp.concatenate([features, side.reshape(steps * batch, -1)], axis=-1)
+        width, norm = self.config.lstm, self.config.lstm_norm
+        projected = nn.Dense(
+            4 * width,
+            kernel_init=nn.initializers.orthogonal(1.0),
+            bias_init=nn.initializers.zeros if norm else self.gate_biases,
+            name="lstm_input",
+        )(features)
+        if norm:
             # Ba et al. (2016). Without it a long training drives the gates to 0 and 1, and the score stands still.
-            projected = nn.LayerNorm(name="lstm_norm")(projected)
+            projected = nn.LayerNorm(bias_init=self.gate_biases, name="lstm_norm")(projected)
         recurrent = self.param("lstm_recurrent", _gate_orthogonal, (width, 4 * width))
         hidden, core_state = lstm(projected.reshape(steps, batch, 4 * width), recurrent, is_first, core_state)
         natural_logits, natural_value = self.head("natural", hidden, self.num_natural_actions)
@@ -138,10 +142,17 @@ class Network(nn.Module):
             for i, x in enumerate(images)
         ]
         features = jnp.concatenate(parts, axis=-1)
+        if self.config.dense_norm:
+            features = nn.LayerNorm(use_bias=False, use_scale=False, name="dense_norm")(features)
         if self.config.dense:
             dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(_RELU_GAIN), name="dense")
             features = nn.relu(dense(features))
         return features
+
+    def gate_biases(self, key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Float[Array, "G"]:
+        """Before learning, 0 but for the forget gates', so that memory lasts some steps (Jozefowicz et al. 2015)."""
+        biases = jnp.array([0.0, self.config.forget_bias, 0.0, 0.0], dtype)
+        return jnp.repeat(biases, shape[0] // 4)
 
     def head(self, name: str, hidden: Float[Array, "T B L"], actions: int) -> tuple[Array, Array]:
         """Softmax logits and value. Small first logits: every action is about equally likely at the start."""
@@ -159,23 +170,18 @@ def _gate_orthogonal(key: Array, shape: tuple[int, int]) -> Array:
 
 def make_network(config: Config, num_natural_actions: int) -> Network:
     """The network that an experiment asks for."""
-    # A packed image does not tell where it was taken. Nor does a canvas whose normalisation makes 0 of what never
-    # changes, as of what is outside: between two rows of Breakout's empty middle it is the same.
-    canvas = isinstance(config.sensor, RingSensor) and config.sensor.layout == "canvas"
-    always = config.network.focal_point == "always" and config.gaze.mode != "none"
     return Network(
         config=config.network,
         num_natural_actions=num_natural_actions,
         num_vision_actions=config.gaze.actions if config.gaze.learned else 0,
-        sees_focal_point=always or not canvas,
     )
 
 
-def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[int, int, int]]) -> Params:
-    """Parameters for images of these shapes (h, w, channels), which the sensor gives."""
+def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[int, int, int]], side: int) -> Params:
+    """Parameters for images of these shapes (h, w, channels), and `side` numbers beside them."""
     roi = [jnp.zeros((1, 1, *shape)) for shape in image_shapes]
     core_state = initial_core_state(network, 1)
-    return network.init(key, roi, jnp.zeros((1, 1, 2)), jnp.zeros((1, 1), bool), core_state)
+    return network.init(key, roi, jnp.zeros((1, 1, side)), jnp.zeros((1, 1), bool), core_state)
 
 
 def initial_core_state(network: Network, batch: int) -> CoreState:

@@ -76,8 +76,9 @@ def decide(
     """The network's part: torso to sampling, and the gaze's move."""
     batch = focal_point.shape[0]
     natural_key, vision_key = jax.random.split(key, (2, batch))
-    images, is_first = [image[None] for image in roi], jnp.zeros((1, batch), bool)
-    output, core_state = agent.forward(params, images, agent.unit(focal_point)[None], is_first, core_state)
+    images, is_first = [image[None] for image in roi], jnp.zeros(batch, bool)
+    side = agent.side(focal_point, jnp.zeros((batch, 2), jnp.int32), jnp.zeros(batch), is_first)
+    output, core_state = agent.forward(params, images, side[None], is_first[None], core_state)
     output = jax.tree.map(lambda x: x[0], output)
     natural_action = jax.vmap(jax.random.categorical)(natural_key, output.natural_logits)
     vision_action, _ = agent.choose_vision(vision_key, output, False)

@@ -31,8 +31,13 @@ _CONFIG = "config.yaml"
 _FAILURE = "failure.txt"
 # Keys that runs have not always had, and what was done before: older runs are read as they were made.
 _BEFORE = {
-    "network": {"lstm_norm": False, "padding": "valid", "focal_point": "packed"},
-    "learner": {"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step"},
+    "network": {
+        **{"lstm_norm": False, "padding": "valid", "focal_point": "packed", "focal_scale": "frame"},
+        **{"dense_norm": False, "last_actions": False, "last_reward": False, "forget_bias": 0.0},
+    },
+    "learner": {
+        **{"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step", "credits_last_gaze": True},
+    },
 }
 # What may change between two starts of a run: none of it changes what a step learns.
 FREE = {

@@ -90,6 +90,13 @@ def to_unit(point: Int[Array, "*n 2"], frame_shape: Shape) -> Float[Array, "*n 2
     return jnp.stack([point[..., axis] / size * 2.0 - 1.0 for axis, size in enumerate(frame_shape)], -1)
 
 
+def to_reach(point: Int[Array, "*n 2"], *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Float[Array, "*n 2"]:
+    """Focal points in [-1, 1]: -1 and 1 at the `limits`, 0 in an axis along which the gaze cannot move."""
+    low, high = limits(gaze=gaze, window=window, frame_shape=frame_shape)
+    ends = enumerate(zip(low.tolist(), high.tolist(), strict=True))
+    return jnp.stack([(2 * point[..., axis] - (lo + hi)) / max(hi - lo, 1) for axis, (lo, hi) in ends], -1)
+
+
 def from_unit(coordinates: Float[Array, "*n 2"], frame_shape: Shape) -> Int[Array, "*n 2"]:
     """The nearest focal points inside the frame: the inverse of `to_unit`."""
     points = [(coordinates[..., axis] + 1.0) * (size / 2) for axis, size in enumerate(frame_shape)]

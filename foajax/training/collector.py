@@ -34,6 +34,11 @@ def update_on(
     return state, metrics
 
 
+# Rollouts that a run plays before its first update. The first tells each pixel's mean, the second how far frames lie
+# from it: without them the input's scale drifts while the network is young.
+ROLLOUTS_TO_OBSERVE = 2
+
+
 class Group(NamedTuple):
     """One group's place in the game, between two rollouts."""
 
@@ -70,7 +75,8 @@ class Collector:
     def collect(self, state: TrainState, first_step: int) -> tuple[list[Rollout], list[list[Outcome]]]:
         """One rollout of each group, and its outcomes step by step.
 
-        `first_step` counts the steps that each environment has made; it seeds the sampling.
+        `first_step` counts the steps that each environment has made, from below 0 where a run first observes; it
+        seeds the sampling.
         """
         acting = (state.params, state.statistics)
         outcomes: list[list[Outcome]] = [[] for _ in self.groups]

@@ -17,7 +17,7 @@ from foajax.config.schema import Config
 from foajax.envs.base import Environment
 from foajax.learning.agent import Agent
 from foajax.learning.learner import loss
-from foajax.learning.programs import Programs, empty_rollout, make_programs, make_state
+from foajax.learning.programs import empty_rollout, make_programs, make_state
 from foajax.training.collector import Collector, update_on
 from foajax.types import SCREEN_SHAPE, TimeStep
 
@@ -49,7 +49,9 @@ def profile(config: Config, environments: list[Environment], directory: str) -> 
     agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
     programs, state = make_programs(agent), make_state(agent, config.seed)
     stopwatch = Stopwatch()
-    timed = Programs(act=stopwatch.timed("act", programs.act), update=stopwatch.timed("update", programs.update))
+    timed = programs._replace(
+        act=stopwatch.timed("act", programs.act), update=stopwatch.timed("update", programs.update)
+    )
     for environment in environments:
         for name in ("send", "recv"):
             setattr(environment, name, stopwatch.timed("env", getattr(environment, name)))

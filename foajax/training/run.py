@@ -21,14 +21,14 @@ from foajax.envs.make import make_environments
 from foajax.launch.processes import Job, Watch
 from foajax.launch.signals import StopRequest
 from foajax.learning.agent import Agent
-from foajax.learning.learner import Metrics
+from foajax.learning.learner import Metrics, explained_variance
 from foajax.learning.programs import make_programs, make_state
 from foajax.learning.sharding import Layout
 from foajax.runs.agents import CHECKPOINTS, begin_from, save_facts
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import RunDir, note_failure, take_over
 from foajax.runs.logger import Logger
-from foajax.training.collector import Collector, update_on
+from foajax.training.collector import ROLLOUTS_TO_OBSERVE, Collector, update_on
 from foajax.training.dump import Dump
 from foajax.training.episodes import EpisodeTracker
 from foajax.training.watchdog import Watchdog, report_fault
@@ -76,6 +76,8 @@ class Run:
         self._watch = Watch(job, config.distributed.timeout, self._rescue)
         with self._watch.expecting_others():
             self._restore()
+        is_new = not self._env_steps and config.train.init_from is None
+        self._to_observe = ROLLOUTS_TO_OBSERVE if is_new else 0
         if run_dir is None or self._checkpoints is None:
             self._say = lambda text: None
             return
@@ -125,6 +127,7 @@ class Run:
         while self._env_steps < train.env_steps and not self._is_to_stop(stop):
             self._keep(compiled=bool(metrics))
             step = self._env_steps // self._config.env.num_envs
+            step -= self._to_observe * self._config.learner.rollout_length
             own, outcomes = self._collector.collect(self._nearby(self._state), step)
             outcomes, games = self._meet(outcomes, stop)
             # Fetched one rollout late: by now they are there, and nothing waits for the device.
@@ -136,11 +139,16 @@ class Run:
             if self._dump:
                 self._dump.remember(self._env_steps, self._state.params, own)
             rollouts = [self._layout.join(rollout) for rollout in own] if self._layout else own
+            self._track(outcomes)
+            if self._to_observe:
+                for rollout in rollouts:
+                    self._state = self._programs.observe(self._state, rollout)
+                self._to_observe -= 1
+                continue
             self._state, metrics = update_on(rollouts, self._state, self._programs, self._config.learner)
             if now - pictured >= _PICTURES_EVERY:
                 self._picture(own[0])
                 pictured = now
-            self._track(outcomes)
             self._env_steps += self._rollout_steps
             self._games = games
             if now - saved >= train.checkpoint_every:
@@ -228,7 +236,7 @@ class Run:
                 "score": self._tracker.mean_score,
                 "length": self._tracker.mean_length,
                 "best_score": self._tracker.best_score,
-                **means,
+                **explained_variance(means),
                 "skipped_updates": rows[-1]["skipped_updates"],
             }
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,8 +14,8 @@ from foajax.envs.base import Environment
 from foajax.envs.make import make
 from foajax.runs.agents import Stored
 
-_FIRST_SEED = 1_000_003  # apart from the seeds of training
-_SEEDS = 2**31 - 2_000_000  # the engines take 32 bits, and add an environment's number
+_SEEDS = 2**31  # seeds to choose from
+_WATCHED = 1_000_003  # keeps what `np.random.SeedSequence` makes of them apart from the seeds of training
 
 
 class Games(NamedTuple):
@@ -22,6 +23,7 @@ class Games(NamedTuple):
 
     returns: np.ndarray  # [episodes] unclipped
     lengths: np.ndarray  # [episodes] agent steps
+    cut: int  # how many of them reached `env.max_episode_steps`
 
 
 def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = False) -> Environment:
@@ -33,15 +35,25 @@ def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = Fals
     if not 0 <= seed < _SEEDS:
         raise ConfigError(f"seed={seed}: accepted is an integer from 0 to {_SEEDS - 1}")
     config, actions = stored.agent.config, stored.agent.num_actions
-    made = make(config, num_envs=num_envs, seed=_FIRST_SEED + seed, render=render)
+    # An engine adds an environment's number to its seed: neighbouring seeds may not lie side by side.
+    first = int(np.random.SeedSequence([_WATCHED, seed]).generate_state(1)[0] >> 2)
+    made = make(config, num_envs=num_envs, seed=first, render=render)
     if made.num_actions != actions:
         made.close()
         raise ConfigError(f"game={config.game}: has {made.num_actions} actions; accepted are {actions}, as in training")
     return made
 
 
-def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: bool) -> Games:
-    """Plays `episodes` games with fixed parameters.
+def play(
+    stored: Stored,
+    *,
+    episodes: int,
+    num_envs: int,
+    seed: int,
+    greedy: bool,
+    progress: Callable[[int], None] | None = None,
+) -> Games:
+    """Plays `episodes` games with fixed parameters; `progress` is told how many have ended, after each step.
 
     Every environment plays the same number of games, to within one, so that short games are not over-represented.
     """
@@ -52,7 +64,7 @@ def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: boo
     state = stored.agent.initial_state(num_envs)
     key = jax.random.key(seed)
     returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
-    finished: list[tuple[float, int]] = []
+    finished: list[tuple[float, int, bool]] = []
     timestep, _ = watched.reset()
     step = 0
     while len(finished) < episodes:
@@ -61,11 +73,15 @@ def play(stored: Stored, *, episodes: int, num_envs: int, seed: int, greedy: boo
         timestep, outcome = watched.recv()
         returns += outcome.score
         lengths += 1 - timestep.is_first
+        most = stored.agent.config.env.max_episode_steps
         for i in np.flatnonzero(outcome.is_over):
             if games[i] < rounds[i]:
-                finished.append((float(returns[i]), int(lengths[i])))
+                finished.append((float(returns[i]), int(lengths[i]), bool(lengths[i] >= most)))
             games[i] += 1
             returns[i], lengths[i] = 0, 0
         step += 1
+        if progress is not None:
+            progress(len(finished))
     watched.close()
-    return Games(returns=np.array([r for r, _ in finished]), lengths=np.array([n for _, n in finished]))
+    scores, steps, cut = map(np.array, zip(*finished, strict=True))
+    return Games(returns=scores, lengths=steps, cut=int(cut.sum()))
