@@ -16,6 +16,7 @@ COMMANDS = {
     "report": "Writes curves, scores, heat maps and costs of a set of runs as one page.",
     "cost": "Measures what a decision costs, sensor by sensor.",
     "status": "Shows what every run below some directories is doing.",
+    "reproduce": "Runs the paper's comparison, stage by stage.",
     "store": "Makes an agent to be shipped from a run.",
     "keep": "Keeps in results/runs/ what others need to judge and repeat a run.",
 }

@@ -1,4 +1,4 @@
-"""`python -m foajax.keep run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/`.
+"""`python -m foajax.keep run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/<game>/`.
 
 Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
 json=<run>/score.json` has found, and `run.json`: command, commits, seed, machine, hours. Then the tables and the
@@ -22,7 +22,7 @@ class Options:
     """What the command takes."""
 
     run: str | None = None  # a run's directory
-    name: str | None = None  # of the directory that it is kept in; null for <game>-<experiment>-s<seed>
+    name: str | None = None  # of the directory that it is kept in; null for <experiment>-s<seed>
 
 
 def keep(arguments: Sequence[str]) -> None:

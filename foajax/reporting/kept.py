@@ -12,11 +12,9 @@ import numpy as np
 import yaml
 
 from foajax.config import shipped
-from foajax.config.compose import compose
-from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, to_mapping
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.reporting.groups import games_of
-from foajax.runs.directory import FREE, load_config
 from foajax.runs.status import newest_checkpoint
 from foajax.sensors.sense import pixel_count
 
@@ -29,16 +27,17 @@ def keep(path: Path, name: str | None) -> Path:
     """Copies what matters of a run."""
     run = read_run(path)
     newest = newest_checkpoint(path) or int(run.env_steps[-1])  # rows of a run that was killed may go on beyond it
-    wanted = {"env_steps": newest, "policy": "sampled", "episodes": 30}
+    wanted = {"env_steps": newest, "policy": "sampled", "episodes": 100}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"evaluate run={path} json={path}/score.json"
         raise ConfigError(f"run={path}: its score.json has {found}; accepted is {wanted}, as {command} writes it")
     config = dataclasses.replace(run.config, run=None)
-    out = KEPT / (name or Path(config.run_dir).name)
+    game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
+    out = KEPT / game / (name or f"{config.name}-s{config.seed}")
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     if out.exists() and (out / "config.yaml").read_text() != text:
-        raise ConfigError(f"name={out.name}: holds another run; accepted is another name=<game>-<name>-s<seed>")
+        raise ConfigError(f"name={out.name}: holds another run; accepted is another name=<name>-s<seed>")
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(text)
     rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
@@ -64,12 +63,6 @@ def _facts(run: RunData, newest: int) -> dict[str, Any]:
     }
 
 
-def _named(run: RunData) -> RunData:
-    """Under the name that it is kept by: runs that other defaults made are not each other's seeds."""
-    name = run.path.name.removeprefix(f"{run.config.game}-").removesuffix(f"-s{run.config.seed}")
-    return run._replace(config=dataclasses.replace(run.config, name=name))
-
-
 def row(run: RunData) -> list[str]:
     """A line of the table."""
     facts, score = json.loads((run.path / "run.json").read_text()), run.evaluation or {}
@@ -77,40 +70,26 @@ def row(run: RunData) -> list[str]:
     return [
         run.config.game,
         f"`{run.config.name}`",
+        str(run.config.seed),
         str(values),
         run.config.gaze.mode,
         f"{facts['env_steps'] / 1e6:.1f} M",
         f"{facts['hours']:.1f}",
         f"{score['mean']:.1f} ± {score['stderr']:.1f}",
-        f"[{run.path.name}]({run.path.name})",
+        f"[{run.path.parent.name}/{run.path.name}]({run.path.parent.name}/{run.path.name})",
     ]
 
 
-def command_today(path: Path) -> str:
-    """The words that a kept run was made by, and the keys whose defaults have changed since."""
-    given = shlex.split(json.loads((path / "run.json").read_text())["command"].partition("foajax.train ")[2])
-    made, today = (dict(flatten(to_mapping(config))) for config in (load_config(path), compose(given)))
-    changed = {key: value for key, value in made.items() if key not in FREE and today.get(key) != value}
-    more = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in changed.items()]
-    return f"python -m foajax.train {shlex.join(given + more)} run=runs/{path.name}"
-
-
 def write_tables(directory: Path = KEPT) -> None:
-    """Makes the tables and the learning curves of all kept runs anew."""
-    paths = [path for path in sorted(directory.iterdir()) if path.is_dir()]
-    runs = [_named(read_run(path)) for path in paths]
-    head = ["game", "experiment", "values", "gaze", "env_steps", "hours", "score", "kept in"]
+    """Makes the table and the learning curves of all kept runs anew."""
+    runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
+    head = ["game", "experiment", "seed", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     lines = [head, ["---"] * len(head), *map(row, runs)]
     intro = (
-        "Score: mean and standard error over 30 whole games, unclipped, sampled policy, of the last checkpoint. Some\n"
-        "were stopped before their `train.env_steps`. Each `run.json` has the command, the commit and the machine.\n"
-        "Steps and hours, here and in the curves, do not count those of an agent that a run began from\n"
-        "(`train.init_from` in its command).\n"
-        "Made by `python -m foajax.keep`."
+        "Score: mean and standard error over 100 whole games, unclipped, sampled policy, of the last checkpoint. Each\n"
+        "`run.json` has the command, the commit and the machine. Made by `python -m foajax.keep`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    commands = "\n".join(map(command_today, paths))
-    repeat = f"The same, in the words of today's defaults:\n\n```sh\n{commands}\n```"
-    (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n\n{repeat}\n")
+    (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n")
     for game, groups in games_of(runs, None).items():
         draw_curves(groups, game, colours_of(groups)).savefig(directory / f"{game}.png", dpi=110)

@@ -7,6 +7,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from foajax.types import Outcome, Rollout, TrainState
 from foajax.viewing.previews import snapshots
 
 _PICTURES_EVERY = 900.0  # seconds
+_BLIND_ROWS = 5  # in a row, before a policy that does not look is warned of
 _GAMES_FOR_A_SCORE = 100  # the mean of fewer does not tell which checkpoint is best
 
 
@@ -61,6 +63,7 @@ class Run:
         environments = self._make_environments(resources)
         agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
         self._layout = Layout(job.devices, job.local_devices) if len(job.devices) > 1 else None
+        self._num_actions, self._blind_rows = agent.num_actions, 0
         self._programs = make_programs(agent, self._layout)
         self._collector = Collector(agent, self._programs, environments, seed=config.seed, part=job.index)
         self._tracker = EpisodeTracker(config.env.num_envs)
@@ -229,6 +232,7 @@ class Run:
             return
         rows = jax.device_get(metrics)
         means = {name: finite_mean([row[name] for row in rows]) for name in rows[0] if name != "skipped_in_a_row"}
+        self._warn_of_blindness(means)
         self._logger.write(
             {
                 "env_steps": self._env_steps,
@@ -240,6 +244,15 @@ class Run:
                 "skipped_updates": rows[-1]["skipped_updates"],
             }
         )
+
+    def _warn_of_blindness(self, means: dict[str, float]) -> None:
+        self._blind_rows = self._blind_rows + 1 if is_blind(means, self._num_actions) else 0
+        if self._blind_rows == _BLIND_ROWS:
+            self._warn(
+                f"at {self._env_steps:,} env_steps the policy is sure of its actions and hardly depends on what is "
+                f"seen (natural_information {means['natural_information']:.3f} nats); a run can stand still like this "
+                "for 100,000 env_steps, and another seed may not"
+            )
 
     def _save(self) -> None:
         if self._checkpoints is not None:
@@ -339,6 +352,16 @@ class Run:
 
     def _warn(self, text: str) -> None:
         self._say(f"warning: {text}")
+
+
+def is_blind(means: Mapping[str, float], num_actions: int) -> bool:
+    """Whether a policy has grown sure of its actions without looking: metrics of one row say so.
+
+    What it has grown surer than chance, log A less its entropy in nats, is partly a preference for some actions
+    whatever is seen, and partly `natural_information`. Runs that learn owe two fifths of it or more to what they see.
+    """
+    gained = math.log(num_actions) - means["natural_entropy"]
+    return gained > 0.15 and means["natural_information"] < 0.2 * gained
 
 
 def finite_mean(values: list[np.ndarray]) -> float:
