@@ -18,7 +18,7 @@ def train(run, mode, seed):
 def test_learned_gaze_earns_more_than_frozen_and_random(tmp_path, seed):
     """By 2 points at least: 12 is what full sight can earn, 2.5 and 3 what the others can (`foajax.envs.seek`).
 
-    Seeds earn 9.3 on average, with a deviation of 0.8 (docs/learning.md).
+    Seeds earn 9.3 on average, with a deviation of 0.8 (docs/log/2026-11-26-learning.md).
     """
     returns = {mode: train(tmp_path / mode, mode, seed) for mode in ("learned", "frozen", "random")}
     assert returns["learned"] > max(returns["frozen"], returns["random"]) + 2, returns
