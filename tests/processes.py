@@ -21,6 +21,7 @@ TINY = [
     "learner.minibatches=2",
     "learner.rollout_length=5",
     "train.log_every=0.01",
+    "learner.schedule=constant",  # so that a run may go on for longer
 ]
 
 

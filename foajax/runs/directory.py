@@ -202,6 +202,8 @@ def check_same_run(path: Path, config: Config) -> None:
     if keys:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
         remedy = "choose another run=<dir> or restore the value"
+        if keys[0] == "train.env_steps":
+            remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
         raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from foajax.training.run import is_blind
+from foajax.training.journal import is_blind
 
 
 @pytest.mark.parametrize(
