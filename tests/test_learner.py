@@ -15,7 +15,13 @@ from foajax.sensors.frames import PIXEL_DECAY
 from foajax.training.collector import Collector, update_on
 
 # Small networks and short rollouts: most of the time goes into compiling them.
-SMALL = ["network.dense=32", "network.lstm=32", "env.num_envs=8", "learner.minibatches=2", "learner.rollout_length=6"]
+SMALL = [
+    "network.dense=32",
+    "network.lstm=32",
+    "env.num_envs=8",
+    "learner.num_minibatches=2",
+    "learner.rollout_length=6",
+]
 # A small full view: cheap, and it tells all that a probe shows.
 VIEW = ["sensor=rings", "sensor.rings=[[80,80,8]]", "sensor.layout=packed", "experiment=nonfoa"]
 
@@ -189,7 +195,7 @@ def test_a_clipped_update_is_counted(seek, scale, clipped):
 
 
 def test_frames_are_counted_once_however_many_passes():
-    one, two = (Loop("game=seek", *VIEW, f"learner.epochs={passes}") for passes in (1, 2))
+    one, two = (Loop("game=seek", *VIEW, f"learner.num_epochs={passes}") for passes in (1, 2))
     one.run(1), two.run(1)
     np.testing.assert_allclose(one.state.statistics.weight, two.state.statistics.weight, rtol=1e-6)
     assert two.state.updates == 2 * one.state.updates
@@ -230,7 +236,7 @@ def test_information_is_what_decisions_tell_of_what_was_seen(seek):
 
 def test_two_groups_see_what_each_would_alone():
     """Groups only interleave: the first of two acts as it would by itself."""
-    loop = Loop("game=seek", *VIEW, "env.groups=2")
+    loop = Loop("game=seek", *VIEW, "env.num_groups=2")
     alone = Collector(loop.agent, loop.programs, make_environments(loop.config, 0)[:1], seed=0)
     (expected,), _ = alone.collect(loop.state, 0)
     (first, second), _ = loop.collect()
@@ -263,7 +269,7 @@ def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
 
 
 def test_the_schedule_counts_the_updates_of_a_rollout_that_has_begun():
-    config = compose.compose([*SMALL, "learner.epochs=3", "train.env_steps=49"])  # rollouts of 48
+    config = compose.compose([*SMALL, "learner.num_epochs=3", "train.env_steps=49"])  # rollouts of 48
     assert total_updates(Agent(config, 4, 34)) == 2 * 2 * 3
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import platform
@@ -18,7 +17,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.parse import ConfigError, replace, to_mapping
 from foajax.config.schema import Config, LogPolarSensor, RingSensor, from_mapping
 from foajax.runs import provenance
 from foajax.runs.directory import load_config, open_run
@@ -78,7 +77,7 @@ def test_every_start_is_added(config):
 
 
 def test_config_survives_the_file_in_every_detail(config, tmp_path):
-    log_polar = dataclasses.replace(
+    log_polar = replace(
         changed(config, learner__adam_eps=3e-17, gaze__start=[40, 41], gaze__bounds="point"),
         sensor=LogPolarSensor(),
         game="gymnasium:ALE/Pong-v5",
@@ -169,7 +168,7 @@ def test_what_was_refused_before_it_began_may_be_corrected(config):
     ("key", "value", "line"),
     [
         ("learner__learning_rate", 0.002, "learner.learning_rate=0.002: the run in {run} has 0.001; "),
-        ("learner__vision__beta", 0.5, "learner.vision.beta=0.5: the run in {run} has 0.003; "),
+        ("learner__vision__entropy_weight", 0.5, "learner.vision.entropy_weight=0.5: the run in {run} has 0.003; "),
         ("learner__clip_ratio", 0.2, "learner.clip_ratio=0.2: the run in {run} has 0.1; "),
         ("game", "pong", "game=pong: the run in {run} has breakout; "),
         ("seed", 3, "seed=3: the run in {run} has 0; "),
@@ -195,14 +194,14 @@ def test_what_means_the_same_is_taken_over(config):
         train__env_steps=7,
         train__log_every=1.5,
         train__checkpoint_every=2.5,
-        train__keep=9,
+        train__keep_checkpoints=9,
         train__max_skipped=3,
         env__threads=2,
         profile=True,
         run=os.path.relpath(config.run_dir),
     )
     open_run(other, command=COMMAND).close()
-    assert load_config(config.run_dir) == dataclasses.replace(other, run=config.run_dir)
+    assert load_config(config.run_dir) == replace(other, run=config.run_dir)
 
 
 def test_the_length_of_a_run_counts_where_the_learning_rate_follows_it(config):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shlex
 from pathlib import Path
@@ -13,7 +12,7 @@ import yaml
 
 from foajax.config import shipped
 from foajax.config.compose import compose
-from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.parse import flatten, refuse, replace, to_mapping
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.reporting.groups import games_of
 from foajax.runs.directory import FREE, load_config
@@ -33,12 +32,12 @@ def keep(path: Path, name: str | None) -> Path:
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"evaluate run={path} json={path}/score.json"
-        raise ConfigError(f"run={path}: its score.json has {found}; accepted is {wanted}, as {command} writes it")
-    config = dataclasses.replace(run.config, run=None)
+        raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
+    config = replace(run.config, run=None)
     out = KEPT / (name or Path(config.run_dir).name)
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     if out.exists() and (out / "config.yaml").read_text() != text:
-        raise ConfigError(f"name={out.name}: holds another run; accepted is another name=<game>-<name>-s<seed>")
+        raise refuse("name", out.name, "another name=<game>-<name>-s<seed>", why="holds another run")
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(text)
     rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
@@ -67,7 +66,7 @@ def _facts(run: RunData, newest: int) -> dict[str, Any]:
 def _named(run: RunData) -> RunData:
     """Under the name that it is kept by: runs that other defaults made are not each other's seeds."""
     name = run.path.name.removeprefix(f"{run.config.game}-").removesuffix(f"-s{run.config.seed}")
-    return run._replace(config=dataclasses.replace(run.config, name=name))
+    return run._replace(config=replace(run.config, name=name))
 
 
 def row(run: RunData) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.envs.atari import is_atari
 from foajax.envs.base import Environment
@@ -53,9 +53,11 @@ class Run:
         self._logger: Logger | None = None
         self._dump: Dump | None = None
         if run_dir is not None:
-            self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=config.train.keep, warn=self._warn)
+            self._checkpoints = Checkpoints(
+                run_dir.path / CHECKPOINTS, keep=config.train.keep_checkpoints, warn=self._warn
+            )
         if run_dir is not None and config.train.dump_skipped:
-            self._dump = Dump(run_dir.path / "skipped", minibatches=config.learner.minibatches, warn=self._warn)
+            self._dump = Dump(run_dir.path / "skipped", minibatches=config.learner.num_minibatches, warn=self._warn)
         self._env_steps = int(job.tell("saved", str(self._newest())))
         self._games: list[dict[str, Any]] | None = None  # of all processes, as they were after the last update
         environments = self._make_environments(resources)
@@ -188,7 +190,9 @@ class Run:
 
     def _rescue(self) -> str:
         if self._checkpoints is None and (run_dir := take_over(Path(self._config.run_dir))):
-            self._checkpoints = Checkpoints(run_dir.path / CHECKPOINTS, keep=self._config.train.keep, warn=self._warn)
+            self._checkpoints = Checkpoints(
+                run_dir.path / CHECKPOINTS, keep=self._config.train.keep_checkpoints, warn=self._warn
+            )
         if self._checkpoints is None:
             return "the first process saves what it can"
         if self._kept is None:
@@ -209,11 +213,10 @@ class Run:
         if int(last["skipped_in_a_row"]) >= most:
             self._log(metrics)
             values = ", ".join(f"{name} {float(last[name]):.4g}" for name in ("loss", "grad_norm", "param_norm"))
-            raise ConfigError(
-                f"train.max_skipped={most}: so many updates in a row were not finite ({values}); the last good "
-                f"parameters are saved at {self._env_steps:,} env_steps; accepted is another run=<dir>, with a "
-                "smaller learner.learning_rate or learner.max_grad_norm"
-            )
+            saved = f"the last good parameters are saved at {self._env_steps:,} env_steps"
+            why = f"so many updates in a row were not finite ({values}); {saved}"
+            accepted = "another run=<dir>, with a smaller learner.learning_rate or learner.max_grad_norm"
+            raise refuse("train.max_skipped", most, accepted, why=why)
 
     def _track(self, outcomes: list[list[Outcome]]) -> None:
         for step in zip(*outcomes, strict=True):
