@@ -195,7 +195,7 @@ def test_a_mapping_takes_new_keys_and_a_later_word_wins():
         ("sensor@eye=constant70", ["sensor@eye=constant70: accepted is key=value"]),
         ("game=pong,breakout", ["game=pong,breakout: accepted is one value", "--multirun"]),
         ("seed=range(3)", ["seed=range(3): accepted is one value", "--multirun"]),
-        ("hydra.run.dir=x", ["hydra.run.dir=x: accepted is this with --multirun only"]),
+        ("hydra.run.dir=x", ["hydra.run.dir=x: accepted is the same with --multirun"]),
         ("game=${nothing}", ["game: ", "'nothing'", "accepted is"]),
         ("game=${oc.env:FOAJAX_NOT_SET}", ["game: ", "'FOAJAX_NOT_SET'", "accepted is"]),
         ("game=${what:1}", ["game: ", "what", "accepted is"]),
@@ -367,8 +367,8 @@ def test_without_a_launcher_each_run_is_a_command_of_its_own(cwd, runs, monkeypa
     [
         (["-m", "--jobs=0"], "--jobs=0: accepted is --jobs=N"),
         (["-m", "--jobs", "4"], "--jobs: accepted is --jobs=N"),
-        (["--jobs=2"], "--jobs=2: accepted is this with --multirun only"),
-        ([*HERE, "--jobs=2"], "--jobs=2: accepted is this with --multirun only"),
+        (["--jobs=2"], "--jobs=2: accepted is the same with --multirun"),
+        ([*HERE, "--jobs=2"], "--jobs=2: accepted is the same with --multirun"),
     ],
 )
 def test_jobs_is_a_number_and_for_local_sweeps(cwd, runs, capsys, arguments, said):
@@ -397,6 +397,64 @@ def test_a_learner_and_a_network_can_be_chosen_for_seek():
     config = composed("experiment=seek", "learner=paper", "network=a3c")
     assert config.learner == composed("learner=paper").learner and config.network == composed("network=a3c").network
     assert composed("experiment=seek").learner.num_epochs == 4 and composed("experiment=seek").network.lstm == 64
+
+
+@pytest.fixture
+def own(tmp_path_factory):
+    """A directory with choices of one's own, one of them with words of before."""
+    files = {
+        "experiment/mine": "# @package _global_\ndefaults:\n  - override /sensor: decreasing_packed\nname: mine\n"
+        "train: {keep: 9}\nlearner: {epochs: 7, natural: {beta: 0.5}}\n",
+        "sensor/small": "defaults: [rings]\nrings: [[8, 8, 1]]\n",
+        "gaze/fast": "step: 16\n",
+    }
+    directory = tmp_path_factory.mktemp("it's, own")
+    for name, text in files.items():
+        (directory / f"{name}.yaml").parent.mkdir()
+        (directory / f"{name}.yaml").write_text(text)
+    return directory
+
+
+def test_choices_of_ones_own_stand_beside_ours(own):
+    config = compose(["experiment=mine", "gaze=fast"], own)
+    assert (config.name, config.sensor) == ("mine", composed("experiment=decreasing_packed").sensor)
+    assert config.gaze.step == 16 and compose(["sensor=small"], own).sensor.window == (8, 8)
+    with pytest.raises(ConfigError, match="experiment=mien: accepted is one of .*mine.*did you mean mine"):
+        compose(["experiment=mien"], own)
+    with pytest.raises(ConfigError, match="experiment=mine: accepted is one of"):
+        compose(["experiment=mine"])
+
+
+def test_words_of_before_in_a_file_give_way_to_the_command_lines(own):
+    config = compose(["experiment=mine", "train.keep_checkpoints=2"], own)
+    assert (config.train.keep_checkpoints, config.learner.num_epochs) == (2, 7)
+    assert config.learner.natural.entropy_weight == config.learner.vision.entropy_weight == 0.5
+
+
+def test_a_run_of_ones_own_is_started_swept_and_shown(cwd, own, runs, capsys, monkeypatch):
+    words = [f"--config-dir={own}", "experiment=mine"]
+    assert run(runs.record, ["--config-dir", str(own), "experiment=mine"]) == run(runs.record, words) == 0
+    assert run(runs.record, [*words, *HERE, "sensor=small,constant70"]) == 0
+    assert [config.name for config in runs] == ["mine", "mine", "mine-sensor=small", "mine-sensor=constant70"]
+    capsys.readouterr()
+    assert run(runs.record, [*words, "--cfg", "job"]) == 0 and "name: mine" in capsys.readouterr().out
+    assert run(runs.record, [words[0], "--help"]) == 0 and "gaze: fast, frozen" in capsys.readouterr().out
+    monkeypatch.setattr(sweep, "run_all", lambda runs, *, jobs, command: int(command[-1] != words[0]))
+    assert run(runs.record, [*words, "-m", "seed=1,2"]) == 0
+    assert run(runs.record, ["--config-dir=nowhere"]) == 2
+    assert "--config-dir=nowhere: accepted is a directory with experiment/" in capsys.readouterr().err
+
+
+def test_words_of_before_are_understood_and_answered_with_todays(cwd, runs, capsys):
+    assert run(runs.record, ["learner.epochs=3", "train.keep=${learner.epochs}"]) == 0
+    assert (runs[0].learner.num_epochs, runs[0].train.keep_checkpoints) == (3, 3)
+    said = "foajax: learner.epochs is now learner.num_epochs\nfoajax: train.keep is now train.keep_checkpoints\n"
+    assert capsys.readouterr().err == said
+    for launcher in (["-m"], HERE):
+        assert run(runs.record, [*launcher, "learner.epochs=0,1"]) == 2
+        assert capsys.readouterr().err.endswith("learner.num_epochs=0: accepted is an integer from 1 to 1000\n")
+    assert run(runs.record, [*HERE, "learner.epochs=3,4"]) == 0
+    assert [config.name for config in runs[1:]] == ["constant70-learner.epochs=3", "constant70-learner.epochs=4"]
 
 
 def test_composing_works_from_any_directory(cwd):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shutil
 import signal
 import subprocess
@@ -17,8 +18,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foajax.config.parse import ConfigError, replace, to_mapping
-from foajax.config.schema import Config, LogPolarSensor, RingSensor, from_mapping
+from foajax.config.parse import ConfigError, flatten, replace, to_mapping
+from foajax.config.schema import RENAMED, Config, LogPolarSensor, RingSensor, from_mapping, renamed
 from foajax.runs import provenance
 from foajax.runs.directory import load_config, open_run
 from foajax.runs.lock import RunError
@@ -115,6 +116,26 @@ def test_a_run_from_before_a_key_is_read_as_it_was_made(config, group, key, befo
     assert getattr(getattr(load_config(config.run_dir), group), key) == mapping[group].pop(key) != before
     file.write_text(yaml.safe_dump(mapping))
     assert getattr(getattr(load_config(config.run_dir), group), key) == before
+
+
+def test_a_run_with_words_of_before_is_read(config):
+    values = {"num_epochs": 3, "num_minibatches": 8, "natural": {"entropy_weight": 0.02}}
+    other = changed(config, train__keep_checkpoints=5, **{f"learner__{key}": value for key, value in values.items()})
+    begun(other)
+    file = Path(config.run_dir) / "config.yaml"
+    text = file.read_text()
+    for old, new in RENAMED.items():
+        text = re.sub(rf"\b{new.rpartition('.')[2]}:", f"{old.rpartition('.')[2]}:", text)
+    assert "  keep: 5\n" in text and "  beta: 0.02\n" in text
+    file.write_text(text)
+    assert load_config(config.run_dir) == other
+    open_run(other, command=COMMAND).close()  # and goes on
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("agents/*/config.yaml")), ids=lambda path: path.parent.name)
+def test_a_shipped_agent_is_read_with_all_that_its_file_says(path):
+    said = dict(flatten(renamed(yaml.safe_load(path.read_text())))) | {"run": str(path.parent)}
+    assert said.items() <= dict(flatten(to_mapping(load_config(path.parent)))).items()
 
 
 def test_load_config_follows_a_moved_run(config, tmp_path):

@@ -82,7 +82,7 @@ def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> 
     if override.is_delete() or override.package is not None or not key:
         raise refuse(one_line(word))
     if override.is_hydra_override():
-        raise refuse(one_line(word), accepted="this with --multirun only")
+        raise refuse(one_line(word), accepted="the same with --multirun")
     text = override.get_value_string()
     offered = choices(config_dir)
     if override.is_sweep_override():
@@ -91,6 +91,8 @@ def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> 
     elif key in offered and value not in offered[key]:
         raise refuse(one_line(word), accepted=offered[key], near=str(value))
     # With ++ an unknown key reaches `from_mapping`, which can say which keys there are.
+    for old, new in RENAMED.items():
+        text = text.replace(f"${{{old}}}", f"${{{new}}}")
     return f"{key}={text}" if key in offered else f"++{RENAMED.get(key, key)}={text}"
 
 

@@ -43,9 +43,7 @@ class RingSensor(Section):
     """A focal area of nested rings; non-FoA, Constant, Decreasing and their (P) forms (Table II)."""
 
     prefix: ClassVar[str] = "sensor."
-    rings: tuple[Ring, ...] = Field(
-        min_length=1, description="The rings, inner to outer, with their subsampling factors."
-    )
+    rings: tuple[Ring, ...] = Field(min_length=1, description="Rings, inner to outer, with their subsampling factors.")
     kind: Literal["rings"] = Field("rings", description="Nested rings.")
     peripheral: Grid | None = Field(None, description="Grid of the coarse background; null for none.")
     layout: Literal["canvas", "packed"] = Field(
@@ -111,11 +109,9 @@ class GazeConfig(Section):
     step: int = Field(4, ge=1, le=10_000, description="Frame pixels that a visual action moves.")
     bounds: Literal["window", "point"] = Field("window", description="What has to stay inside the frame.")
     start: Literal["centre", "random"] | Point = Field(
-        "centre", description="Where an episode starts; moved within the bounds."
+        "centre", description="Start of an episode, moved within bounds."
     )
-    path: tuple[Point, ...] = Field(
-        (), description="For mode=scripted: the points visited in turn, moved within the bounds."
-    )
+    path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved within bounds.")
 
     def check(self) -> None:
         if self.mode == "scripted" and not self.path:
@@ -136,7 +132,7 @@ class EnvConfig(Section):
     num_groups: int = Field(
         1,
         ge=1,
-        description="Sets of environments that step in turn: one decides while the others' emulators run.",
+        description="Sets of environments that step in turn, while another decides.",
     )
     frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
     crop_top: Mapping[str, Row] = Field(
@@ -199,13 +195,9 @@ class LearnerConfig(Section):
 
     prefix: ClassVar[str] = "learner."
     rollout_length: int = Field(64, ge=2, le=100_000, description="Steps per environment between two updates, T.")
-    num_minibatches: int = Field(
-        16, ge=1, le=100_000, description="Groups of environments whose gradients are applied one after another."
-    )
+    num_minibatches: int = Field(16, ge=1, le=100_000, description="Groups of environments, each with a gradient step.")
     num_epochs: int = Field(2, ge=1, le=1000, description="Passes over a rollout.")
-    clip_ratio: float | None = Field(
-        0.1, gt=0, description="PPO's clipping of the probability ratio; null for plain A2C."
-    )
+    clip_ratio: float | None = Field(0.1, gt=0, description="PPO's clipping of probability ratios; null for plain A2C.")
     learning_rate: float = Field(1e-3, gt=0, description="Adam's, after the warm-up.")
     full_rate_inputs: int | None = Field(
         256, ge=1, le=10**9, description="Layers with more inputs learn at a rate that much smaller; null for none."
@@ -218,24 +210,18 @@ class LearnerConfig(Section):
     adam_b1: float = Field(0.9, ge=0, lt=1, description="Decay of Adam's first moment.")
     adam_b2: float = Field(0.999, ge=0, lt=1, description="Decay of Adam's second moment.")
     adam_eps: float = Field(1e-5, gt=0, description="Added to the root of the second moment.")
-    max_grad_norm: float | None = Field(
-        0.5, gt=0, description="Norm to which the whole gradient is clipped; null for no clipping."
-    )
+    max_grad_norm: float | None = Field(0.5, gt=0, description="Largest norm of the whole gradient; null for no limit.")
     reduction: Literal["mean", "sum"] = Field(
-        "mean", description="Of the losses over time; over environments it is always the mean."
+        "mean", description="Of losses over time; over environments always the mean."
     )
     normalize_advantages: bool = Field(True, description="Advantages of a minibatch get mean 0 and deviation 1.")
     value_weight: float = Field(0.5, ge=0, description="Weight of both value losses.")
     vision_weight: float = Field(0.25, ge=0, description="Weight of both of the vision head's losses.")
-    value_target: Literal["n_step", "lambda"] = Field(
-        "lambda", description="Returns to the rollout's end, or mixed as the advantages are."
-    )
+    value_target: Literal["n_step", "lambda"] = Field("lambda", description="N-step or lambda-returns.")
     vision_bootstrap: Literal["consistent", "literal"] = Field(
         "consistent", description="Bootstrap of the vision head's n-step returns: consistent, or literal as printed."
     )
-    credits_last_gaze: bool = Field(
-        True, description="A policy gradient for the visual action before an end, which nothing follows."
-    )
+    credits_last_gaze: bool = Field(True, description="The visual action before an end gets a policy gradient too.")
     natural: HeadConfig = Field(HeadConfig(), description="The head that acts in the environment.")
     vision: HeadConfig = Field(
         HeadConfig(),
@@ -259,9 +245,7 @@ class TrainConfig(Section):
     checkpoint_every: float = Field(60.0, gt=0, description="Seconds between two checkpoints.")
     keep_checkpoints: int = Field(3, ge=1, le=10**9, description="How many of the newest checkpoints are kept.")
     devices: int = Field(1, ge=1, le=10**9, description="Devices of each process, which share its environments.")
-    max_skipped: int = Field(
-        20, ge=1, le=10**9, description="Updates in a row that may be skipped as not finite before the run stops."
-    )
+    max_skipped: int = Field(20, ge=1, le=10**9, description="Not finite updates in a row that stop the run.")
     dump_skipped: bool = Field(False, description="Keep the batches that such rows begin with, in <run>/skipped.")
 
 
@@ -273,7 +257,7 @@ class DistributedConfig(Section):
     processes: int | None = Field(None, ge=1, description="How many processes share the run.")
     process: int | None = Field(None, ge=0, description="This one's number, from 0.")
     timeout: float = Field(
-        180.0, gt=0, description="Seconds to wait for the others before saving and ending; more than env.timeout."
+        180.0, gt=0, description="Seconds to wait for others before the run saves and ends; more than env.timeout."
     )
 
     def check(self) -> None:

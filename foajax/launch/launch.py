@@ -67,11 +67,13 @@ def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) 
     if is_sweep and not set(rest) - {*_MULTIRUN, *jobs}:
         return sweep.run_all(runs, jobs=at_a_time, command=(*sweep.COMMAND, *flag))
     if jobs:
-        raise refuse(jobs[0], accepted="this with --multirun only, and without a hydra/launcher")
+        raise refuse(jobs[0], accepted="the same with --multirun, and without a hydra/launcher")
     failures: dict[str, str] = {}
     swept = sweep.swept_by(ours) if is_sweep else None
-    words = [checked(word, sweep=True, config_dir=directory) if word in ours else word for word in arguments]
-    code = _run_hydra(lambda node: _job(task, swept, failures, node), [*words, *flag])
+    theirs = [word for word in rest if word.startswith(("hydra.", "hydra/"))]  # after flags: its parser wants it so
+    words = [*theirs, *(checked(word, sweep=True, config_dir=directory) for word in ours)]
+    flags = [word for word in rest if word not in theirs]
+    code = _run_hydra(lambda node: _job(task, swept, failures, node), [*flags, *flag, *words])
     return sweep.summarise([run.config for run in runs], failures) or code if is_sweep else code
 
 
