@@ -21,7 +21,7 @@ _KINDS: dict[str, type[Section]] = {
     "rings": RingSensor,
     "logpolar": LogPolarSensor,
 }  # sensors of one's own, by themselves
-_WHOLE = "nonfoa"  # a sensor that has nothing around it to leave out
+_WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave out
 
 
 def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
@@ -56,7 +56,7 @@ def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None)
 
 
 def register() -> None:
-    """Tells Hydra what is in no file: the keys' defaults, and sensors and experiments without a canvas."""
+    """Tells Hydra what is in no file: the keys' defaults, sensors without a canvas, an experiment for each sensor."""
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance().store
@@ -64,8 +64,8 @@ def register() -> None:
     for name, cls in _KINDS.items():
         store(name, defaults(cls), group="sensor")
     for name in _packed():
-        plain = name.removesuffix("_packed")
-        store(name, {"defaults": [plain], "layout": "packed"}, group="sensor")
+        store(name, {"defaults": [name.removesuffix("_packed")], "layout": "packed"}, group="sensor")
+    for name in (*_rings(), *_packed()):
         node = {"defaults": [{"override /sensor": name}], "name": name}
         store(name, node, group="experiment", package="_global_")
 
@@ -129,16 +129,20 @@ def _first_line(error: Exception) -> str:
 
 
 @functools.cache
+def _rings() -> tuple[str, ...]:
+    """The paper's sensors but for the whole frame."""
+    return tuple(sorted(file.stem for file in experiments().glob("sensor/*.yaml") if file.stem != _WHOLE))
+
+
 def _packed() -> tuple[str, ...]:
-    """The paper's sensors without the canvas around their values."""
-    names = sorted(file.stem for file in experiments().glob("sensor/*.yaml"))
-    return tuple(f"{name}_packed" for name in names if name != _WHOLE)
+    """The same without the canvas around their values."""
+    return tuple(f"{name}_packed" for name in _rings())
 
 
 @functools.cache
 def choices(config_dir: str | Path | None = None) -> dict[str, tuple[str, ...]]:
     """The names that each group offers: those of experiments/, what is made of them, and those of `config_dir`."""
-    found: dict[str, set[str]] = {"sensor": {*_KINDS, *_packed()}, "experiment": set(_packed())}
+    found: dict[str, set[str]] = {"sensor": {*_KINDS, *_packed()}, "experiment": {*_rings(), *_packed()}}
     for directory in [experiments()] + ([] if config_dir is None else [Path(config_dir)]):
         for file in directory.glob("*/*.yaml"):
             found.setdefault(file.parent.name, set()).add(file.stem)

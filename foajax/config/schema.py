@@ -129,11 +129,7 @@ class EnvConfig(Section):
     prefix: ClassVar[str] = "env."
     engine: Literal["envpool", "ale"] = Field("envpool", description="What runs Atari games.")
     num_envs: int = Field(32, ge=1, le=100_000, description="Environments, of all processes together.")
-    num_groups: int = Field(
-        1,
-        ge=1,
-        description="Sets of environments that step in turn, while another decides.",
-    )
+    num_groups: int = Field(1, ge=1, description="Sets of environments that step in turn, while another decides.")
     frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
     crop_top: Mapping[str, Row] = Field(
         {"default": 34, "beam_rider": 20}, description="First screen row that is kept, by game."
@@ -166,8 +162,7 @@ class NetworkConfig(Section):
         "cover", description="Whether the nature torso sees what its strides would leave out (cover) or not (valid)."
     )
     focal_point: Literal["always", "packed"] = Field(
-        "always",
-        description="When the LSTM is told the focal point: always, or where no canvas shows it (packed).",
+        "always", description="When the LSTM is told the focal point: always, or where no canvas shows it (packed)."
     )
     focal_scale: Literal["reach", "frame"] = Field(
         "reach", description="What lies at -1 and 1 of that point: the ends of its reach, or of the frame."
@@ -177,8 +172,7 @@ class NetworkConfig(Section):
     forget_bias: float = Field(1.0, ge=-100, le=100, description="Of the LSTM's forget gates, before learning.")
     lstm_norm: bool = Field(True, description="Layer norm of the input's part of the LSTM's gates.")
     normalization: Literal["pixel", "running", "frame", "none"] = Field(
-        "pixel",
-        description="Frames less a mean: of each pixel, of all pixels so far, of one frame, or none.",
+        "pixel", description="Frames less a mean: of each pixel, of all pixels so far, of one frame, or none."
     )
 
 
@@ -278,7 +272,7 @@ class Config(Section):
     name: Name = Field(description="Name of the experiment, e.g. constant70.")
     sensor: Annotated[
         Annotated[RingSensor, Tag("rings")] | Annotated[LogPolarSensor, Tag("logpolar")], Discriminator(_kind)
-    ] = Field(description="What is seen of a frame.")
+    ]
     game: Name = Field("breakout", description="An Atari game, seek, probe:<name>, or gymnasium:<id>.")
     seed: int = Field(0, ge=0, le=2**31 - 10_001, description="Seed of environments, parameters and actions.")
     run: str | None = Field(None, description="The run's directory; null for runs/<game>-<name>-s<seed>.")
