@@ -100,8 +100,9 @@ class Section(BaseModel):
     prefix: ClassVar[str] = ""  # of the keys' names, where a section is made by itself
 
     def __init__(self, /, *values: Any, **named: Any) -> None:
-        names = list(type(self).model_fields)[: len(values)]
-        named = dict(zip(names, values, strict=True), **named)
+        if len(values) > len(type(self).model_fields):
+            raise TypeError(f"{type(self).__name__} has {len(type(self).model_fields)} keys, not {len(values)}")
+        named = dict(zip(type(self).model_fields, values, strict=False), **named)
         try:
             super().__init__(**named)
         except ValidationError as error:
