@@ -13,8 +13,7 @@ from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.envs.atari import check_game
 from foajax.envs.make import make_environments
-from foajax.launch import launch
-from foajax.launch import processes as distributed
+from foajax.launch import launch, processes
 from foajax.launch.signals import StopRequest
 from foajax.runs.agents import check_source
 from foajax.runs.directory import is_run, open_run
@@ -34,15 +33,15 @@ def train(config: Config) -> int:
     try:
         _train(config)
     except EnvironmentFault as fault:
-        return distributed.leave(report_fault(config, str(fault), fault))
+        return processes.leave(report_fault(config, str(fault), fault))
     except Exception as error:
         if not jax.distributed.is_initialized():
             raise
         if isinstance(error, ConfigError):
             print(f"foajax: error: {error}", file=sys.stderr, flush=True)
-            return distributed.leave(2)
+            return processes.leave(2)
         traceback.print_exc()
-        return distributed.leave(1)
+        return processes.leave(1)
     return 0
 
 
@@ -65,14 +64,14 @@ def _train(config: Config) -> None:
     check(config)
     with contextlib.ExitStack() as resources:
         if config.profile:
-            if config.train.devices > 1 or distributed.where(config):
+            if config.train.devices > 1 or processes.where(config):
                 raise refuse("profile", "true", "train.devices=1 and a single process")
             environments = make_environments(config, 0)
             for environment in environments:
                 resources.callback(environment.close)
             profiling.profile(config, environments, f"{config.run_dir}/profile")
             return
-        job = distributed.start(config)
+        job = processes.start(config)
         job.agree(config)
         if config.train.dump_skipped and len(job.devices) > 1:
             raise refuse("train.dump_skipped", "true", "false where a run has several devices")

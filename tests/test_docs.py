@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from foajax.config.schema import Config
-from foajax.config.table import page
+from foajax.config.table import page as page_of_keys
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = [
@@ -35,7 +35,7 @@ def test_there_are_blocks_and_values():
 
 
 def test_the_page_of_keys_is_what_the_schema_says():
-    assert (ROOT / "docs/keys.md").read_text() == page(Config) + "\n"
+    assert (ROOT / "docs/keys.md").read_text() == page_of_keys(Config) + "\n"
 
 
 def test_links_lead_somewhere():

@@ -331,7 +331,7 @@ class Run:
 
     def _unsaved(self) -> str:
         reason = f"it stands at {self._env_steps:,} env_steps, of which {self._newest():,} are saved"
-        return f"run={self._config.run_dir}: {reason}; accepted is a directory that can be written"
+        return str(refuse("run", self._config.run_dir, "a directory that can be written", why=reason))
 
     def _how_it_ends(self, stop: str | None) -> str:
         if stop is None:

@@ -26,7 +26,7 @@ from foajax.config.parse import ConfigError
 from foajax.runs import durable
 from foajax.runs.checkpoints import CheckpointError, Checkpoints
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 class State(NamedTuple):
