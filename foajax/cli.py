@@ -34,7 +34,7 @@ def override(config: SectionT, arguments: Sequence[str], prefix: str, keys: Sequ
     values = _values([word.removeprefix(f"{prefix}.") for word in arguments], type(config), f"{prefix}.")
     for key, value in values.items():
         if key not in keys:
-            raise refuse(f"{prefix}.{key}", value, keys, near=key)
+            raise refuse(f"{prefix}.{key}", value, keys, why="cannot be changed", near=key)
     return replace(config, **values)
 
 

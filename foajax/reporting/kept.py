@@ -13,6 +13,7 @@ import yaml
 from foajax.config import shipped
 from foajax.config.compose import compose
 from foajax.config.parse import flatten, refuse, replace, to_mapping
+from foajax.config.schema import RENAMED
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.reporting.groups import games_of
 from foajax.runs.directory import FREE, load_config
@@ -87,7 +88,8 @@ def row(run: RunData) -> list[str]:
 
 def command_today(path: Path) -> str:
     """The words that a kept run was made by, and the keys whose defaults have changed since."""
-    given = shlex.split(json.loads((path / "run.json").read_text())["command"].partition("foajax.train ")[2])
+    words = shlex.split(json.loads((path / "run.json").read_text())["command"].partition("foajax.train ")[2])
+    given = [RENAMED.get(key, key) + "=" + value for key, _, value in (word.partition("=") for word in words)]
     made, today = (dict(flatten(to_mapping(config))) for config in (load_config(path), compose(given)))
     changed = {key: value for key, value in made.items() if key not in FREE and today.get(key) != value}
     more = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in changed.items()]
