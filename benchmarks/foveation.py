@@ -9,7 +9,6 @@ machine. Run it on an idle one.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
 import platform
@@ -21,9 +20,11 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 from foajax import cli, runtime
 from foajax.config.compose import compose
+from foajax.config.parse import Section
 from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
 from foajax.sensors.sense import sense
 from foajax.viewing.sheet import PAPER
@@ -115,13 +116,12 @@ def against_opencv() -> dict[str, float] | None:
     return {"foajax": sensed, "opencv": looped, "speedup": looped / sensed}
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    out: str | None = None
+    out: str | None = Field(None, description="File for the result.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 

@@ -11,7 +11,6 @@ foajax itself does not use. Run it on an idle machine.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import platform
 import statistics
@@ -24,10 +23,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section
 from foajax.config.schema import Config, NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.learning.optimizer import make_optimizer
@@ -40,20 +40,16 @@ ACTIONS = 4
 PARTS = ("forward", "forward_backward", "update", "update_fused")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    experiments: str = "nonfoa,constant70_packed"
-    torso: str = "nature"  # of the group network/
-    num_envs: int = 4  # of a minibatch
-    repeats: int = 40
-    out: str | None = None
+    experiments: str = Field("nonfoa,constant70_packed", description="Names with commas between them.")
+    torso: str = Field("nature", description="Choice of the group network/.")
+    num_envs: int = Field(4, ge=1, description="Environments of a minibatch.")
+    repeats: int = Field(40, ge=5, description="Repeats of each timing.")
+    out: str | None = Field(None, description="File for the result.")
 
-    def __post_init__(self) -> None:
-        for key, least in (("num_envs", 1), ("repeats", 5)):
-            if getattr(self, key) < least:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= {least}")
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 

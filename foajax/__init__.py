@@ -14,11 +14,13 @@ __all__ = [
     "FoveatedVectorObservation",
     "LogPolarSensor",
     "RingSensor",
+    "compose",
     "load_agent",
     "sense",
 ]
 
 if TYPE_CHECKING:
+    from foajax.config.compose import compose
     from foajax.config.parse import ConfigError
     from foajax.config.schema import Config, LogPolarSensor, RingSensor
     from foajax.learning.agent import Agent
@@ -34,7 +36,8 @@ else:
         "RingSensor": "config.schema",
         "FoveatedObservation": "sensors.wrappers",
         "FoveatedVectorObservation": "sensors.wrappers",
-        "load_agent": "store",
+        "compose": "config.compose",
+        "load_agent": "runs.agents",
         "sense": "sensors.sense",
     }
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import runpy
 import sys
+
+from foajax.config.parse import refuse
 
 COMMANDS = {
     "train": "Trains one agent, or a sweep of them, or goes on training.",
@@ -30,9 +31,7 @@ def main() -> None:
         print("\n".join(f"  {command:9} {sentence}" for command, sentence in COMMANDS.items()))
         return
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        print(f"foajax: error: {name}: accepted is one of {', '.join(COMMANDS)}{hint}", file=sys.stderr)
+        print(f"foajax: error: {refuse(name, accepted=COMMANDS, near=name)}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [sys.argv[0], *words]
     runpy.run_module(f"foajax.{name}", run_name="__main__", alter_sys=True)

@@ -10,7 +10,6 @@ that take turns, so that whatever else the machine does slows all experiments al
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import platform
 import sys
@@ -18,30 +17,28 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
+from pydantic import Field
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from foajax import cli
 from foajax.config.compose import list_experiments
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section
 from foajax.reporting.cost import BATCHES, PARTS, REFERENCE, measure
 from foajax.runtime import wait_in_place
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    experiments: str | None = None  # names with commas between them; null for all
-    torso: Literal["nature", "a3c"] = "nature"  # the group network/
-    json: str | None = None  # file for the result
-    repeats: int = 50
+    experiments: str | None = Field(None, description="Names with commas between them; null for all.")
+    torso: Literal["nature", "a3c"] = Field("nature", description="Choice of the group network/.")
+    json_file: str | None = Field(None, alias="json", description="File for the result.")
+    repeats: int = Field(50, ge=1, description="Repeats of each timing.")
 
-    def __post_init__(self) -> None:
-        if self.repeats < 1:
-            raise ConfigError(f"repeats={self.repeats}: accepted is an integer >= 1")
-        cli.check_file("json", self.json)
+    def check(self) -> None:
+        cli.check_file("json", self.json_file)
 
 
 def cost(arguments: Sequence[str]) -> None:
@@ -51,8 +48,8 @@ def cost(arguments: Sequence[str]) -> None:
     names = list_experiments() if options.experiments is None else options.experiments.split(",")
     records = measure(names, torso=options.torso, repeats=options.repeats)
     _print(records)
-    if options.json:
-        cli.write_json("json", options.json, records)
+    if options.json_file:
+        cli.write_json("json", options.json_file, records)
 
 
 def _print(records: Sequence[dict[str, Any]]) -> None:

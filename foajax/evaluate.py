@@ -13,13 +13,14 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section, replace
 from foajax.runs.agents import load_agent
 from foajax.viewing.games import play
 
@@ -30,23 +31,23 @@ _PROTOCOL = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
-    episodes: int = 100
-    policy: Literal["sampled", "greedy"] = "sampled"  # greedy games that begin alike are alike: 31 ways with no-ops
-    checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
-    json: str | None = None  # file for the result
-    num_envs: int = 25  # games played at once
-    seed: int = 0
+    run: str = Field(description="A run directory or a shipped agent.")
+    episodes: int = Field(100, ge=1, description="Games to play.")
+    policy: Literal["sampled", "greedy"] = Field(
+        "sampled", description="Greedy games that begin alike are alike: 31 ways with no-ops."
+    )
+    checkpoint: Literal["newest", "best"] = Field(
+        "newest", description="Of a run: the latest, or that with the best score in training."
+    )
+    json_file: str | None = Field(None, alias="json", description="File for the result.")
+    num_envs: int = Field(25, ge=1, description="Games played at once.")
+    seed: int = Field(0, description="Seed of the games.")
 
-    def __post_init__(self) -> None:
-        for key in ("episodes", "num_envs"):
-            if getattr(self, key) < 1:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
-        cli.check_file("json", self.json)
+    def check(self) -> None:
+        cli.check_file("json", self.json_file)
 
 
 def evaluate(arguments: Sequence[str]) -> None:
@@ -55,7 +56,7 @@ def evaluate(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
     stored = load_agent(options.run, best=options.checkpoint == "best")
     env = cli.override(stored.agent.config.env, protocol, "env", _PROTOCOL)
-    config = dataclasses.replace(stored.agent.config, env=env)
+    config = replace(stored.agent.config, env=env)
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("games", total=options.episodes)
         games = play(
@@ -81,8 +82,8 @@ def evaluate(arguments: Sequence[str]) -> None:
         "returns": games.returns.tolist(),
         "lengths": games.lengths.tolist(),
     }
-    if options.json:
-        cli.write_json("json", options.json, result)
+    if options.json_file:
+        cli.write_json("json", options.json_file, result)
     _print(result)
 
 

@@ -7,29 +7,29 @@ learning curves of all kept runs are made anew. Without `run=`, only that.
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section, refuse
 from foajax.reporting import kept
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str | None = None  # a run's directory
-    name: str | None = None  # of the directory that it is kept in; null for <experiment>-s<seed>
+    run: str | None = Field(None, description="A run's directory; null to make the tables anew only.")
+    name: str | None = Field(None, description="Directory that it is kept in; null for <experiment>-s<seed>.")
 
 
 def keep(arguments: Sequence[str]) -> None:
     """The command; prints where a run is kept."""
     options = cli.parse(Options, arguments)
     if not kept.KEPT.is_dir():
-        raise ConfigError(f"{kept.KEPT}: is missing; accepted is a checkout, which has kept runs")
+        raise refuse(str(kept.KEPT), accepted="a checkout, which has kept runs", why="is missing")
     if options.run is not None:
         print(kept.keep(Path(options.run), options.name))
     kept.write_tables()

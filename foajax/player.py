@@ -5,32 +5,28 @@ The page is one file and needs nothing else, no network and no server.
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from typing import Literal
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section
 from foajax.runs.agents import load_agent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing.player_page import write_page
 from foajax.viewing.recording import play, progress_bar
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
-    out: str = "player"  # directory of the page
-    policy: Literal["sampled", "greedy"] = "sampled"
-    seed: int = 0
-    steps: int | None = None  # cuts the game after so many decisions; null for the whole game
-
-    def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise ConfigError(f"steps={self.steps}: accepted is null or an integer >= 1")
+    run: str = Field(description="A run directory or a shipped agent.")
+    out: str = Field("player", description="Directory of the page.")
+    policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
+    seed: int = Field(0, description="Seed of the game.")
+    steps: int | None = Field(None, ge=1, description="Cut the game after so many decisions; null for the whole game.")
 
 
 def player(arguments: Sequence[str]) -> None:

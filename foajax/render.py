@@ -7,14 +7,15 @@ skip of 4.
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section, refuse
 from foajax.runs.agents import load_agent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing import heatmap
@@ -22,26 +23,21 @@ from foajax.viewing.recording import play, progress_bar
 from foajax.viewing.video import has_ffmpeg, write_video
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
-    out: str | None = None  # directory; null for render/ in the run's
-    episodes: int = 1
-    policy: Literal["sampled", "greedy"] = "sampled"
-    seed: int = 0  # of the first game; the next one has the next seed
-    steps: int | None = None  # cuts a game after so many decisions; null for whole games
-    format: Literal["mp4", "gif"] | None = None  # null for mp4 where it can be written
-    video: bool = True  # false for the heat map alone
+    run: str = Field(description="A run directory or a shipped agent.")
+    out: str | None = Field(None, description="Directory of the files; null for render/ in the run's.")
+    episodes: int = Field(1, ge=1, description="Games to play.")
+    policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
+    seed: int = Field(0, description="Seed of the first game; the next one has the next seed.")
+    steps: int | None = Field(None, ge=1, description="Cut a game after so many decisions; null for whole games.")
+    format: Literal["mp4", "gif"] | None = Field(None, description="Of videos; null for mp4 where that can be written.")
+    video: bool = Field(True, description="Write videos; false for the heat map alone.")
 
-    def __post_init__(self) -> None:
-        for key in ("episodes", "steps"):
-            value = getattr(self, key)
-            if value is not None and value < 1:
-                raise ConfigError(f"{key}={value}: accepted is an integer >= 1")
+    def check(self) -> None:
         if self.format == "mp4" and not has_ffmpeg():
-            raise ConfigError("format=mp4: accepted is gif where imageio-ffmpeg is missing (pip install -e '.[video]')")
+            raise refuse("format", "mp4", "gif where imageio-ffmpeg is missing (pip install -e '.[video]')")
 
 
 def render(arguments: Sequence[str]) -> None:

@@ -8,35 +8,31 @@ not there, or not of whole games that the newest checkpoint played with sampled 
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, Section, refuse
 from foajax.reporting.curves import read_run
 from foajax.reporting.groups import games_of, runs_of
 from foajax.reporting.report_page import build, find_maps, note
 from foajax.runtime import wait_in_place
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes besides the runs."""
 
-    out: str = "report"  # directory
-    # Only the experiments of a figure of the paper.
-    preset: Literal["constant", "decreasing", "peripheral"] | None = None
-    episodes: int = 3  # games for a heat map that has to be made; 0 for none
-    repeats: int = 50  # of each timing of a decision; 0 for no costs
-
-    def __post_init__(self) -> None:
-        for key in ("episodes", "repeats"):
-            if getattr(self, key) < 0:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 0")
+    out: str = Field("report", description="Directory of the page.")
+    preset: Literal["constant", "decreasing", "peripheral"] | None = Field(
+        None, description="Only the experiments of a figure of the paper."
+    )
+    episodes: int = Field(3, ge=0, description="Games for a heat map that has to be made; 0 for none.")
+    repeats: int = Field(50, ge=0, description="Repeats of each timing of a decision; 0 for no costs.")
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -45,7 +41,7 @@ def report(arguments: Sequence[str]) -> None:
     paths = [word for word in arguments if "=" not in word or os.path.isdir(word)]
     options = cli.parse(Options, [word for word in arguments if word not in paths])
     if not paths:
-        raise ConfigError("no runs: accepted is report runs/<a> runs/<b> ... out=report")
+        raise refuse("no runs", accepted="report runs/<a> runs/<b> ... out=report")
     wait_in_place()
     runs = [read_run(path) for path in dict.fromkeys(map(Path, paths))]
     games = games_of(runs, options.preset)

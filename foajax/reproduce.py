@@ -8,7 +8,6 @@ run=<dir>` keeps a run in results/.
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -17,12 +16,13 @@ from pathlib import Path
 from typing import Literal
 
 import yaml
+from pydantic import Field
 from rich.console import Console
 from rich.table import Table
 
 from foajax import cli
 from foajax.config import shipped
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section, refuse
 from foajax.launch import sweep
 from foajax.runs.directory import is_run
 from foajax.runs.status import inspect, is_finished
@@ -30,20 +30,19 @@ from foajax.runs.status import inspect, is_finished
 _EPISODES = 100  # whole games that a final policy is scored in
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    stage: int | None = None  # null for all, one after another
-    jobs: int = 1  # runs at a time, each with its share of the cores
-    show: Literal["table", "commands"] | None = None  # in place of running anything
+    stage: int | None = Field(None, description="Which stage to run; null for all, one after another.")
+    jobs: int = Field(1, ge=1, description="Runs at a time, each with its share of the cores.")
+    show: Literal["table", "commands"] | None = Field(
+        None, description="Print how far each run is, or a command for each that is left, and run nothing."
+    )
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         most = len(stages())
         if self.stage is not None and not 1 <= self.stage <= most:
-            raise ConfigError(f"stage={self.stage}: accepted is null or an integer from 1 to {most}")
-        if self.jobs < 1:
-            raise ConfigError(f"jobs={self.jobs}: accepted is an integer >= 1")
+            raise refuse("stage", self.stage, f"null or an integer from 1 to {most}")
 
 
 def stages() -> list[dict]:

@@ -11,39 +11,36 @@ brightest pixel of the frame is drawn white.
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.parse import ConfigError
-from foajax.config.schema import Config
+from foajax.config.parse import Section, refuse
+from foajax.config.schema import Config, Point
 from foajax.envs.make import make
 from foajax.sensors.frames import to_frame
 from foajax.viewing.sheet import ALL, contact_sheet, draw, save
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes besides keys of the sensor."""
 
-    sensor: str = "constant70"  # one of the group sensor/, or all
-    game: str = "breakout"
-    points: tuple[tuple[int, int], ...] = ()  # (y, x) in frame pixels; none for the frame's centre
-    out: str = "show.png"
-    steps: int = 60  # random actions before the frame is taken
-    seed: int = 0
-    all: bool = False  # the same as sensor=all
+    sensor: str = Field("constant70", description="A choice of the group sensor/, or all.")
+    game: str = Field("breakout", description="The game whose frame is shown.")
+    points: tuple[Point, ...] = Field((), description="Focal points in frame pixels; none for the frame's centre.")
+    out: str = Field("show.png", description="The image, a .png file.")
+    steps: int = Field(60, ge=0, description="Random actions before the frame is taken.")
+    seed: int = Field(0, description="Seed of the game.")
+    all: bool = Field(False, description="The same as sensor=all.")
 
-    def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"steps={self.steps}: accepted is an integer >= 0")
+    def check(self) -> None:
         if not self.out.endswith(".png"):
-            raise ConfigError(f"out={self.out}: accepted is a file name that ends in .png")
+            raise refuse("out", self.out, "a file name that ends in .png")
 
 
 def play(config: Config, steps: int) -> np.ndarray:
@@ -66,7 +63,7 @@ def show(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, [word for word in arguments if word not in own])
     sheet = options.all or options.sensor == "all"
     if sheet and own:
-        raise ConfigError(f"{own[0]}: accepted is a key of one sensor, without sensor=all")
+        raise refuse(own[0], accepted="a key of one sensor, without sensor=all")
     words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
     configs = {name: compose([f"sensor={name}", *words]) for name in (ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
@@ -74,7 +71,7 @@ def show(arguments: Sequence[str]) -> None:
     points = options.points or ((height // 2, width // 2),)
     for y, x in points:
         if not (0 <= y < height and 0 <= x < width):
-            raise ConfigError(f"points=[{y}, {x}]: accepted is [y, x] inside the frame, {height}x{width}")
+            raise refuse("points", f"[{y}, {x}]", f"[y, x] inside the frame, {height}x{width}")
     frame = play(config, options.steps)
     if sheet:
         image = contact_sheet(frame, {name: each.sensor for name, each in configs.items()}, points)

@@ -13,20 +13,20 @@ It reads what the runs write and holds nothing, so it may run anywhere that sees
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import datetime
 import os
 import sys
 import time
 from collections.abc import Sequence
 
+from pydantic import Field
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section
 from foajax.runs.status import RunStatus, find_runs, inspect
 
 _COLOURS = {"running": "green", "finished": "blue", "failed": "red", "stalled": "yellow"}
@@ -54,16 +54,11 @@ def table(runs: Sequence[RunStatus]) -> Table:
     return drawn
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes after its directories."""
 
-    every: float = 2.0  # seconds between two pictures
-    once: bool = False  # print one picture and end, as where the output is no terminal
-
-    def __post_init__(self) -> None:
-        if not 0 < self.every <= 86_400:
-            raise ConfigError(f"every={self.every}: accepted is seconds > 0, at most 86400")
+    every: float = Field(2.0, gt=0, le=86_400, description="Seconds between two pictures.")
+    once: bool = Field(False, description="Print one picture and end, as where the output is no terminal.")
 
 
 def status(arguments: Sequence[str]) -> None:

@@ -5,15 +5,16 @@ It has parameters and frame statistics only, as one safetensors file, and can be
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config.parse import ConfigError
+from foajax.config.parse import Section, refuse
 from foajax.runs.agents import FACTS, Stored, load_agent, load_score, save_agent
 from foajax.runs.directory import PARAMETERS
 
@@ -26,20 +27,21 @@ def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
         found = {key: result[key] for key in expected}
         score = {key: result[key] for key in ("mean", "stderr", "episodes", "policy")}
     except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"score={file}: accepted is a file that evaluate json=<file> has written") from None
+        raise refuse("score", file, "a file that evaluate json=<file> has written") from None
     if found != expected:
-        raise ConfigError(f"score={file}: is of {found}; accepted is that of this agent, {expected}")
+        raise refuse("score", file, f"that of this agent, {expected}", why=f"is of {found}")
     return score
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str
-    out: str
-    checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
-    score: str | None = None  # file that `evaluate json=` has written, to go with the agent
+    run: str = Field(description="A run directory or a shipped agent.")
+    out: str = Field(description="Directory of the agent.")
+    checkpoint: Literal["newest", "best"] = Field(
+        "newest", description="Of a run: the latest, or that with the best score in training."
+    )
+    score: str | None = Field(None, description="File that `evaluate json=` has written, to go with the agent.")
 
 
 def export(arguments: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.envs.atari import check_game
 from foajax.envs.make import make_environments
@@ -54,7 +54,7 @@ def check(config: Config) -> None:
     window, frame = config.sensor.window, config.env.frame_shape
     if config.gaze.mode == "none" and window != frame:
         sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
-        raise ConfigError(f"gaze.mode=none: accepted is a focal area {sizes}; or learned, frozen, random, scripted")
+        raise refuse("gaze.mode", "none", f"a focal area {sizes}; or learned, frozen, random, scripted")
     check_game(config)
     if config.train.init_from is not None and not is_run(Path(config.run_dir)):  # one that goes on does not need it
         check_source(config.train.init_from)
@@ -65,7 +65,7 @@ def _train(config: Config) -> None:
     with contextlib.ExitStack() as resources:
         if config.profile:
             if config.train.devices > 1 or processes.where(config):
-                raise ConfigError("profile=true: accepted is train.devices=1 and a single process")
+                raise refuse("profile", "true", "train.devices=1 and a single process")
             environments = make_environments(config, 0)
             for environment in environments:
                 resources.callback(environment.close)
@@ -74,7 +74,7 @@ def _train(config: Config) -> None:
         job = processes.start(config)
         job.agree(config)
         if config.train.dump_skipped and len(job.devices) > 1:
-            raise ConfigError("train.dump_skipped=true: accepted is false where a run has several devices")
+            raise refuse("train.dump_skipped", "true", "false where a run has several devices")
         stop = StopRequest()
         command = [sys.executable, *sys.argv]
         devices = [device.device_kind for device in job.devices]
@@ -85,7 +85,7 @@ def _train(config: Config) -> None:
             run = Run(config, job, run_dir, resources)
         except OSError as error:  # its files: whatever an environment raises is a fault of its own
             reason = f"cannot be used ({error})"
-            raise ConfigError(f"run={config.run_dir}: {reason}; accepted is a directory to write to") from None
+            raise refuse("run", config.run_dir, "a directory to write to", why=reason) from None
         run.loop(stop)
 
 

@@ -13,7 +13,13 @@ from foajax.learning.programs import make_programs, make_state
 from foajax.training.collector import Collector, update_on
 
 # Small networks and short rollouts: most of the time goes into compiling them.
-SMALL = ["network.dense=32", "network.lstm=32", "env.num_envs=8", "learner.minibatches=2", "learner.rollout_length=6"]
+SMALL = [
+    "network.dense=32",
+    "network.lstm=32",
+    "env.num_envs=8",
+    "learner.num_minibatches=2",
+    "learner.rollout_length=6",
+]
 # A small full view: cheap, and it tells all that a probe shows.
 VIEW = ["sensor=rings", "sensor.rings=[[80,80,8]]", "sensor.layout=packed", "experiment=nonfoa"]
 

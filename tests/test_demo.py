@@ -137,4 +137,4 @@ def test_help_names_every_key(capsys):
     assert cli.run(demo.demo, ["--help"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("`python -m foajax.demo`")
-    assert "\n  steps=6000: an integer\n" in out and "\n  game=null: a string or null\n" in out
+    assert "\n  steps=6000  Decisions at most; " in out and "Accepted: an integer >= 1.\n" in out

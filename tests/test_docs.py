@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from foajax.config.schema import Config
+from foajax.config.table import page as page_of_keys
+
 ROOT = Path(__file__).parent.parent
 BLOCKS = [
     pytest.param(block, id=f"{page}-{i}")
@@ -29,6 +32,10 @@ def test_a_block_of_code_runs_and_gives_what_it_says(block, monkeypatch):
 def test_there_are_blocks_and_values():
     assert len(BLOCKS) == 4
     assert sum(len(SAID.findall(str(block.values[0]))) for block in BLOCKS) == 4
+
+
+def test_the_page_of_keys_is_what_the_schema_says():
+    assert (ROOT / "docs/keys.md").read_text() == page_of_keys(Config) + "\n"
 
 
 def test_links_lead_somewhere():

@@ -54,9 +54,12 @@ def test_another_protocol_is_played_and_noted(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("env.frame_shape=[84,84]", "env.frame_shape=[84,84]: accepted of env are engine, frame_skip,"),
-        ("env.stickiness=0.25", "env.stickiness=0.25: accepted of env are engine, frame_skip, noop_max"),
-        ("env.sticky_actions=2", "env.sticky_actions=2.0: accepted is a probability in [0, 1)"),
+        (
+            "env.frame_shape=[84,84]",
+            "env.frame_shape=[84, 84]: cannot be changed; accepted is one of engine, frame_skip,",
+        ),
+        ("env.stickiness=0.25", "env.stickiness=0.25: cannot be changed; accepted is one of engine, frame_skip,"),
+        ("env.sticky_actions=2", "env.sticky_actions=2.0: accepted is a number in [0, 1)"),
     ],
 )
 def test_what_a_protocol_cannot_change_is_refused(capsys, word, said):

@@ -182,7 +182,7 @@ def test_a_gaze_that_is_not_learned_leaves_its_head_out(recording):
     "words, message",
     [
         (["run=nowhere"], "run=nowhere: does not exist"),
-        (["run=nowhere", "steps=0"], "steps=0: accepted is null or an integer >= 1"),
+        (["run=nowhere", "steps=0"], "steps=0: accepted is an integer >= 1 or null"),
         (["run=nowhere", "policy=best"], "policy=best: accepted is one of sampled, greedy"),
     ],
 )

@@ -164,11 +164,11 @@ def test_the_page_is_whole_in_a_browser(runs, tmp_path):
 
 
 def test_a_sweeps_directories_are_runs_and_twice_the_same_is_one(tmp_path, capsys):
-    run = make_run(tmp_path, "seek-small-learner.epochs=3-s0", words=["game=seek"], scores=[1.0, 2.0])
+    run = make_run(tmp_path, "seek-small-learner.num_epochs=3-s0", words=["game=seek"], scores=[1.0, 2.0])
     words = [str(run), f"{run}/", f"out={tmp_path / 'out'}", "episodes=0", "repeats=0"]
     assert cli.run(report.report, words) == 0, capsys.readouterr().err
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "learner.epochs=3" in page and "2 seeds" not in page
+    assert "learner.num_epochs=3" in page and "2 seeds" not in page
 
 
 def test_an_evaluation_of_an_earlier_checkpoint_is_named(tmp_path):

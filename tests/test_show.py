@@ -143,10 +143,10 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
     [
         ("sensor=constant71", "sensor=constant71: accepted is one of"),
         ("sensor=rings", "sensor.rings: missing; accepted is sensor.rings=value"),
-        ("sensor.ring=3", "sensor.ring=3: unknown key; accepted are rings, kind, peripheral, layout, pooling"),
+        ("sensor.ring=3", "sensor.ring=3: unknown key; accepted is one of rings, kind, peripheral, layout, pooling"),
         ("sensor=all sensor.layout=packed", "sensor.layout=packed: accepted is a key of one sensor, without sensor=a"),
         ("points=[[40,80]]", "points=[40, 80]: accepted is [y, x] inside the frame, 80x80"),
-        ("points=40", "points=40: accepted is a list of [an integer, an integer]"),
+        ("points=40", "points=40: accepted is a list of [y, x]"),
         ("steps=-1", "steps=-1: accepted is an integer >= 0"),
         ("out=view.gif", "out=view.gif: accepted is a file name that ends in .png"),
         ("out=/nowhere/at/all.png", "out=/nowhere/at/all.png: accepted is a file that can be written"),

@@ -1,46 +1,64 @@
-"""What a run is made of: frozen dataclasses, checked when they are built. Standard library only.
+"""What a run is made of: every key with its type, its bounds, its default and a sentence on it, in one place.
 
-A mapping (from YAML, from a command line) becomes a `Config` through `from_mapping`; whatever is
-unknown, of the wrong type or out of range raises `ConfigError` with one line that names the key,
-the value and what is accepted.
+Hydra's base configuration, `--help`, docs/keys.md and the errors come from here. Standard library and pydantic only.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 import math
-from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
-from foajax.config.parse import build, check, check_types, file_name
+from pydantic import Discriminator, Field, Tag
+
+from foajax.config.parse import Section, build, file_name, refuse
+
+# Words of before, which are still understood, and today's.
+RENAMED = {
+    "env.groups": "env.num_groups",
+    "learner.minibatches": "learner.num_minibatches",
+    "learner.epochs": "learner.num_epochs",
+    "learner.natural.beta": "learner.natural.entropy_weight",
+    "learner.vision.beta": "learner.vision.entropy_weight",
+    "train.keep": "train.keep_checkpoints",
+}
 
 
-@dataclasses.dataclass(frozen=True)
-class RingSensor:
+def _says(accepted: str) -> Any:
+    """What a type accepts, where that is not plain from the type."""
+    return Field(json_schema_extra={"accepted": accepted})
+
+
+Point = Annotated[tuple[int, int], _says("[y, x]")]
+Ring = Annotated[tuple[int, int, int], _says("[height, width, factor] with 1 <= factor <= height and width")]
+Grid = Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], _says("[rows, columns] >= 1")]
+Side = Annotated[int, Field(ge=8, le=10_000)]
+Shape = Annotated[tuple[Side, Side], _says("[height, width], each from 8 to 10000")]
+Row = Annotated[int, Field(ge=0, le=50), _says("a screen row from 0 to 50 (160 rows are kept of 210)")]
+Name = Annotated[str, Field(pattern=r"\S"), _says("a name")]
+
+
+class RingSensor(Section):
     """A focal area of nested rings; non-FoA, Constant, Decreasing and their (P) forms (Table II)."""
 
-    rings: tuple[tuple[int, int, int], ...]  # (height, width, subsampling factor), inner to outer
-    kind: Literal["rings"] = "rings"
-    peripheral: tuple[int, int] | None = None  # grid of the coarse background, e.g. (5, 5)
-    layout: Literal["canvas", "packed"] = "canvas"
-    pooling: Literal["mean", "stride"] = "mean"
+    prefix: ClassVar[str] = "sensor."
+    rings: tuple[Ring, ...] = Field(min_length=1, description="Rings, inner to outer, with their subsampling factors.")
+    kind: Literal["rings"] = Field("rings", description="Nested rings.")
+    peripheral: Grid | None = Field(None, description="Grid of the coarse background; null for none.")
+    layout: Literal["canvas", "packed"] = Field(
+        "canvas", description="Whether the values stand at their place in a frame, or alone, without the canvas."
+    )
+    pooling: Literal["mean", "stride"] = Field("mean", description="What stands for a block of pixels: mean or corner.")
 
-    def __post_init__(self) -> None:
-        check_types(self, "sensor")
-        check(len(self.rings) > 0, "sensor.rings", self.rings, "at least one [height, width, factor]")
-        for ring in self.rings:
-            height, width, factor = ring
-            check(
-                1 <= factor <= min(height, width),
-                "sensor.rings",
-                ring,
-                "[height, width, factor] with 1 <= factor <= height and width",
-            )
+    def check(self) -> None:
+        for height, width, factor in self.rings:
+            if not 1 <= factor <= min(height, width):
+                accepted = "[height, width, factor] with 1 <= factor <= height and width"
+                raise refuse("rings", (height, width, factor), accepted)
         for inner, outer in zip(self.rings, self.rings[1:], strict=False):
-            nested = inner[0] <= outer[0] and inner[1] <= outer[1] and inner[:2] != outer[:2]
-            check(nested, "sensor.rings", self.rings, "rings that nest, each larger than the one before")
-        if self.peripheral is not None:
-            check(min(self.peripheral) >= 1, "sensor.peripheral", self.peripheral, "null or [rows, columns] >= 1")
+            if not (inner[0] <= outer[0] and inner[1] <= outer[1] and inner[:2] != outer[:2]):
+                raise refuse("rings", self.rings, "rings that nest, each larger than the one before")
 
     @property
     def window(self) -> tuple[int, int]:
@@ -48,24 +66,20 @@ class RingSensor:
         return self.rings[-1][:2]
 
 
-@dataclasses.dataclass(frozen=True)
-class LogPolarSensor:
+class LogPolarSensor(Section):
     """A log-polar retina: rings x wedges around the focal point, radii growing geometrically."""
 
-    kind: Literal["logpolar"] = "logpolar"
-    rings: int = 35
-    wedges: int = 35
-    fovea: float = 3.0  # radius of the innermost ring, a disc, frame pixels
-    radius: float = 40.0  # outer radius, frame pixels
-    sampling: Literal["area", "bilinear"] = "area"
+    prefix: ClassVar[str] = "sensor."
+    kind: Literal["logpolar"] = Field("logpolar", description="A log-polar retina.")
+    rings: int = Field(35, ge=2, le=1000, description="How many rings there are.")
+    wedges: int = Field(35, ge=4, le=1000, description="How many values each ring has.")
+    fovea: float = Field(3.0, gt=0, description="Radius of the innermost ring, a disc, in frame pixels.")
+    radius: float = Field(40.0, gt=0, le=10_000, description="Outer radius in frame pixels.")
+    sampling: Literal["area", "bilinear"] = Field("area", description="A value is the mean of its area, or one sample.")
 
-    def __post_init__(self) -> None:
-        check_types(self, "sensor")
-        check(2 <= self.rings <= 1000, "sensor.rings", self.rings, "an integer from 2 to 1000")
-        check(4 <= self.wedges <= 1000, "sensor.wedges", self.wedges, "an integer from 4 to 1000")
-        check(self.fovea > 0, "sensor.fovea", self.fovea, "a radius > 0")
-        radius = f"a radius > sensor.fovea={self.fovea} and <= 10000"
-        check(self.fovea < self.radius <= 10_000, "sensor.radius", self.radius, radius)
+    def check(self) -> None:
+        if self.fovea >= self.radius:
+            raise refuse("radius", self.radius, f"a radius > sensor.fovea={self.fovea} and <= 10000")
 
     @property
     def window(self) -> tuple[int, int]:
@@ -77,22 +91,31 @@ class LogPolarSensor:
 Sensor = RingSensor | LogPolarSensor
 
 
-@dataclasses.dataclass(frozen=True)
-class GazeConfig:
+def _kind(value: Any) -> str | None:
+    """Which sensor a value is; rings where it is not said."""
+    if isinstance(value, Mapping):
+        return str(value.get("kind", "rings"))
+    return getattr(value, "kind", None)
+
+
+class GazeConfig(Section):
     """How the focal point moves."""
 
-    mode: Literal["none", "learned", "frozen", "random", "scripted"] = "learned"
-    actions: Literal[5, 9] = 5  # stay, up, down, left, right; 9 adds the diagonals
-    step: int = 4  # frame pixels a visual action moves
-    bounds: Literal["window", "point"] = "window"  # what has to stay inside the frame
-    start: Literal["centre", "random"] | tuple[int, int] = "centre"  # of an episode; moved within bounds
-    path: tuple[tuple[int, int], ...] = ()  # scripted: the points (y, x) visited in turn, moved within bounds
+    prefix: ClassVar[str] = "gaze."
+    mode: Literal["none", "learned", "frozen", "random", "scripted"] = Field(
+        "learned", description="What moves the focal point; none for a sensor that shows the whole frame."
+    )
+    actions: Literal[5, 9] = Field(5, description="Stay, up, down, left, right; 9 adds the diagonals.")
+    step: int = Field(4, ge=1, le=10_000, description="Frame pixels that a visual action moves.")
+    bounds: Literal["window", "point"] = Field("window", description="What has to stay inside the frame.")
+    start: Literal["centre", "random"] | Point = Field(
+        "centre", description="Start of an episode, moved within bounds."
+    )
+    path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved within bounds.")
 
-    def __post_init__(self) -> None:
-        check_types(self, "gaze")
-        check(1 <= self.step <= 10_000, "gaze.step", self.step, "an integer from 1 to 10000")
-        if self.mode == "scripted":
-            check(len(self.path) > 0, "gaze.path", self.path, "at least one [y, x] where gaze.mode=scripted")
+    def check(self) -> None:
+        if self.mode == "scripted" and not self.path:
+            raise refuse("path", self.path, "at least one [y, x] where gaze.mode=scripted")
 
     @property
     def learned(self) -> bool:
@@ -100,248 +123,205 @@ class GazeConfig:
         return self.mode == "learned"
 
 
-@dataclasses.dataclass(frozen=True)
-class EnvConfig:
+class EnvConfig(Section):
     """The environment and its preprocessing (Table III)."""
 
-    engine: Literal["envpool", "ale"] = "envpool"
-    num_envs: int = 32
-    groups: int = 1  # sets of environments that step in turn: with 2, one decides while the other's emulators run
-    frame_shape: tuple[int, int] = (80, 80)  # what the sensor looks at
-    crop_top: Mapping[str, int] = dataclasses.field(default_factory=lambda: {"default": 34, "beam_rider": 20})
-    frame_skip: int = 4
-    noop_max: int = 30  # no-ops before an episode are drawn from [0, noop_max]
-    clip_rewards: bool = True
-    episodic_life: bool = True  # a lost life ends the learner's episode
-    fire_on_reset: bool = True
-    sticky_actions: float = 0.0  # probability that the emulator repeats the last action
-    max_episode_steps: int = 27_000  # agent steps
-    threads: int = 0  # of the engine; 0 lets it choose
-    timeout: float = 120.0  # seconds that a step may take before the engine is taken for hung
-
-    def __post_init__(self) -> None:
-        check(1 <= self.num_envs <= 100_000, "env.num_envs", self.num_envs, "an integer from 1 to 100000")
-        check(self.groups >= 1, "env.groups", self.groups, "an integer >= 1")
-        fits = min(self.frame_shape) >= 8 and max(self.frame_shape) <= 10_000
-        check(fits, "env.frame_shape", self.frame_shape, "[height, width], each from 8 to 10000")
-        check("default" in self.crop_top, "env.crop_top", dict(self.crop_top), "a mapping with the key 'default'")
-        for game, row in self.crop_top.items():
-            check(0 <= row <= 50, f"env.crop_top.{game}", row, "a screen row from 0 to 50 (160 rows are kept of 210)")
-        check(1 <= self.frame_skip <= 1000, "env.frame_skip", self.frame_skip, "an integer from 1 to 1000")
-        check(0 <= self.noop_max <= 200, "env.noop_max", self.noop_max, "an integer from 0 to 200")
-        check(0 <= self.sticky_actions < 1, "env.sticky_actions", self.sticky_actions, "a probability in [0, 1)")
-        # The engines count frames in 32 bits, and abort the process where the system has no threads left.
-        steps = "an integer from 1 to 2000000"
-        check(1 <= self.max_episode_steps <= 2_000_000, "env.max_episode_steps", self.max_episode_steps, steps)
-        check(0 <= self.threads <= 1024, "env.threads", self.threads, "an integer from 0 to 1024")
-        check(self.timeout > 0, "env.timeout", self.timeout, "seconds > 0")
-
-
-@dataclasses.dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes of the network."""
-
-    torso: Literal["nature", "a3c"] = "nature"
-    dense: int = 256  # units between torso and LSTM; 0 for none
-    dense_norm: bool = False  # layer norm of what enters these units
-    lstm: int = 256
-    padding: Literal["cover", "valid"] = "cover"  # valid: the nature torso leaves out what its strides do not fit
-    focal_point: Literal["always", "packed"] = "always"  # which gaze tells the LSTM where it is; packed: no canvas's
-    focal_scale: Literal["reach", "frame"] = (
-        "reach"  # of that point: -1 and 1 are the ends of its reach, or of the frame
+    prefix: ClassVar[str] = "env."
+    engine: Literal["envpool", "ale"] = Field("envpool", description="What runs Atari games.")
+    num_envs: int = Field(32, ge=1, le=100_000, description="Environments, of all processes together.")
+    num_groups: int = Field(1, ge=1, description="Sets of environments that step in turn, while another decides.")
+    frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
+    crop_top: Mapping[str, Row] = Field(
+        {"default": 34, "beam_rider": 20}, description="First screen row that is kept, by game."
     )
-    last_actions: bool = True  # the LSTM is told both actions of the step before
-    last_reward: bool = True  # and the reward that followed
-    forget_bias: float = 1.0  # of the LSTM's forget gates, before learning
-    lstm_norm: bool = True  # layer norm of the input's part of the LSTM's gates
-    normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
+    frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per step.")
+    noop_max: int = Field(30, ge=0, le=200, description="No-ops before an episode are drawn from 0 to this.")
+    clip_rewards: bool = Field(True, description="Clip rewards to [-1, 1] for learning.")
+    episodic_life: bool = Field(True, description="A lost life ends the learner's episode.")
+    fire_on_reset: bool = Field(True, description="Press FIRE where a game waits for it.")
+    sticky_actions: float = Field(0.0, ge=0, lt=1, description="Probability that the emulator repeats the last action.")
+    # The engines count frames in 32 bits, and abort the process where the system has no threads left.
+    max_episode_steps: int = Field(27_000, ge=1, le=2_000_000, description="Agent steps after which a game is cut.")
+    threads: int = Field(0, ge=0, le=1024, description="Threads of the engine; 0 lets it choose.")
+    timeout: float = Field(120.0, gt=0, description="Seconds per step after which the engine is taken for hung.")
 
-    def __post_init__(self) -> None:
-        check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
-        check(1 <= self.lstm <= 16_384, "network.lstm", self.lstm, "an integer from 1 to 16384")
-        check(abs(self.forget_bias) <= 100, "network.forget_bias", self.forget_bias, "a number from -100 to 100")
+    def check(self) -> None:
+        if "default" not in self.crop_top:
+            raise refuse("crop_top", self.crop_top, "a mapping with the key 'default'")
 
 
-@dataclasses.dataclass(frozen=True)
-class HeadConfig:
+class NetworkConfig(Section):
+    """The network's parts and their sizes."""
+
+    prefix: ClassVar[str] = "network."
+    torso: Literal["nature", "a3c"] = Field("nature", description="The convolutions.")
+    dense: int = Field(256, ge=0, le=16_384, description="Units between torso and LSTM; 0 for none.")
+    dense_norm: bool = Field(False, description="Layer norm of what enters these units.")
+    lstm: int = Field(256, ge=1, le=16_384, description="Units of the LSTM.")
+    padding: Literal["cover", "valid"] = Field(
+        "cover", description="Whether the nature torso sees what its strides would leave out (cover) or not (valid)."
+    )
+    focal_point: Literal["always", "packed"] = Field(
+        "always", description="When the LSTM is told the focal point: always, or where no canvas shows it (packed)."
+    )
+    focal_scale: Literal["reach", "frame"] = Field(
+        "reach", description="What lies at -1 and 1 of that point: the ends of its reach, or of the frame."
+    )
+    last_actions: bool = Field(True, description="The LSTM is told both actions of the step before.")
+    last_reward: bool = Field(True, description="The LSTM is told the reward of the step before.")
+    forget_bias: float = Field(1.0, ge=-100, le=100, description="Of the LSTM's forget gates, before learning.")
+    lstm_norm: bool = Field(True, description="Layer norm of the input's part of the LSTM's gates.")
+    normalization: Literal["pixel", "running", "frame", "none"] = Field(
+        "pixel", description="Frames less a mean: of each pixel, of all pixels so far, of one frame, or none."
+    )
+
+
+class HeadConfig(Section):
     """What one head learns with."""
 
-    relative_keys: ClassVar[bool] = True  # a head does not know whose it is; the rest name their keys in full
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    beta: float = 0.003  # weight of the entropy
-
-    def __post_init__(self) -> None:
-        check(0 <= self.gamma <= 1, "gamma", self.gamma, "a number in [0, 1]")
-        check(0 <= self.gae_lambda <= 1, "gae_lambda", self.gae_lambda, "a number in [0, 1]")
-        check(self.beta >= 0, "beta", self.beta, "a number >= 0")
+    gamma: float = Field(0.99, ge=0, le=1, description="Discount per step.")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="Lambda of the generalised advantages.")
+    entropy_weight: float = Field(0.003, ge=0, description="Weight of the policy's entropy.")
 
 
-@dataclasses.dataclass(frozen=True)
-class LearnerConfig:
+class LearnerConfig(Section):
     """The update."""
 
-    rollout_length: int = 64  # T
-    minibatches: int = 16  # groups of environments whose gradients are applied one after another
-    epochs: int = 2  # passes over a rollout
-    clip_ratio: float | None = 0.1  # PPO's clipping of the probability ratio; null for plain A2C
-    learning_rate: float = 1e-3
-    full_rate_inputs: int | None = 256  # layers with more inputs have a rate that much smaller; null for none
-    warmup_updates: int = 1000  # over which the learning rate rises; 0 for none
-    schedule: Literal["constant", "linear"] = "linear"  # linear falls to 0 at train.env_steps, skipped updates apart
-    amsgrad: bool = False  # divide by the largest second moment so far, in place of Adam's latest
-    adam_b1: float = 0.9
-    adam_b2: float = 0.999
-    adam_eps: float = 1e-5
-    max_grad_norm: float | None = 0.5  # of the whole gradient; null for no clipping
-    reduction: Literal["mean", "sum"] = "mean"  # of the losses over time; over environments always the mean
-    normalize_advantages: bool = True
-    value_weight: float = 0.5
-    vision_weight: float = 0.25  # of both of the vision head's losses
-    value_target: Literal["n_step", "lambda"] = "lambda"  # to the rollout's end, or mixed as the advantages are
-    vision_bootstrap: Literal["consistent", "literal"] = "consistent"  # of the vision head's n-step returns
-    credits_last_gaze: bool = True  # a policy gradient for the visual action before an end, which nothing follows
-    natural: HeadConfig = HeadConfig()
-    vision: HeadConfig = HeadConfig()
+    prefix: ClassVar[str] = "learner."
+    rollout_length: int = Field(64, ge=2, le=100_000, description="Steps per environment between two updates, T.")
+    num_minibatches: int = Field(16, ge=1, le=100_000, description="Groups of environments, each with a gradient step.")
+    num_epochs: int = Field(2, ge=1, le=1000, description="Passes over a rollout.")
+    clip_ratio: float | None = Field(0.1, gt=0, description="PPO's clipping of probability ratios; null for plain A2C.")
+    learning_rate: float = Field(1e-3, gt=0, description="Adam's, after the warm-up.")
+    full_rate_inputs: int | None = Field(
+        256, ge=1, le=10**9, description="Layers with more inputs learn at a rate that much smaller; null for none."
+    )
+    warmup_updates: int = Field(1000, ge=0, le=10**9, description="Updates over which the rate rises; 0 for none.")
+    schedule: Literal["constant", "linear"] = Field(
+        "linear", description="The rate after that; linear falls to 0 at train.env_steps, skipped updates apart."
+    )
+    amsgrad: bool = Field(False, description="Divide by the largest second moment so far, in place of Adam's latest.")
+    adam_b1: float = Field(0.9, ge=0, lt=1, description="Decay of Adam's first moment.")
+    adam_b2: float = Field(0.999, ge=0, lt=1, description="Decay of Adam's second moment.")
+    adam_eps: float = Field(1e-5, gt=0, description="Added to the root of the second moment.")
+    max_grad_norm: float | None = Field(0.5, gt=0, description="Largest norm of the whole gradient; null for no limit.")
+    reduction: Literal["mean", "sum"] = Field(
+        "mean", description="Of losses over time; over environments always the mean."
+    )
+    normalize_advantages: bool = Field(True, description="Advantages of a minibatch get mean 0 and deviation 1.")
+    value_weight: float = Field(0.5, ge=0, description="Weight of both value losses.")
+    vision_weight: float = Field(0.25, ge=0, description="Weight of both of the vision head's losses.")
+    value_target: Literal["n_step", "lambda"] = Field("lambda", description="N-step or lambda-returns.")
+    vision_bootstrap: Literal["consistent", "literal"] = Field(
+        "consistent", description="Bootstrap of the vision head's n-step returns: consistent, or literal as printed."
+    )
+    credits_last_gaze: bool = Field(True, description="The visual action before an end gets a policy gradient too.")
+    natural: HeadConfig = Field(HeadConfig(), description="The head that acts in the environment.")
+    vision: HeadConfig = Field(
+        HeadConfig(),
+        description="The head that moves the gaze; follows the natural head until it is set.",
+        json_schema_extra={"follows": "learner.natural"},
+    )
 
-    def __post_init__(self) -> None:
-        ranges = {"rollout_length": (2, 100_000), "minibatches": (1, 100_000), "epochs": (1, 1000)}
-        ranges["warmup_updates"] = (0, 10**9)
-        for key, (least, most) in ranges.items():
-            value = getattr(self, key)
-            check(least <= value <= most, f"learner.{key}", value, f"an integer from {least} to {most}")
-        inputs = self.full_rate_inputs
-        accepted = f"null or an integer from 1 to {10**9}"
-        check(inputs is None or 1 <= inputs <= 10**9, "learner.full_rate_inputs", inputs, accepted)
-        for key in ("learning_rate", "adam_eps"):
-            check(getattr(self, key) > 0, f"learner.{key}", getattr(self, key), "a number > 0")
-        for key in ("adam_b1", "adam_b2"):
-            check(0 <= getattr(self, key) < 1, f"learner.{key}", getattr(self, key), "a number in [0, 1)")
-        for key in ("clip_ratio", "max_grad_norm"):
-            value = getattr(self, key)
-            check(value is None or value > 0, f"learner.{key}", value, "null or a number > 0")
-        for key in ("value_weight", "vision_weight"):
-            check(getattr(self, key) >= 0, f"learner.{key}", getattr(self, key), "a number >= 0")
-        applies = self.vision_bootstrap == "consistent" or self.value_target == "n_step"
-        accepted = f"consistent where learner.value_target={self.value_target}"
-        check(applies, "learner.vision_bootstrap", self.vision_bootstrap, accepted)
+    def check(self) -> None:
+        if self.vision_bootstrap == "literal" and self.value_target == "lambda":
+            accepted = "consistent where learner.value_target=lambda"
+            raise refuse("vision_bootstrap", self.vision_bootstrap, accepted)
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Section):
     """The loop around the learner."""
 
-    env_steps: int = 5_000_000  # when to stop
-    init_from: str | None = None  # run or shipped agent whose parameters a new run begins with
-    log_every: float = 10.0  # seconds
-    checkpoint_every: float = 60.0  # seconds
-    keep: int = 3  # newest checkpoints kept
-    devices: int = 1  # of each process, that share its environments
-    max_skipped: int = 20  # updates in a row that may be skipped as not finite before the run stops
-    dump_skipped: bool = False  # keep the batches that such rows begin with, in <run>/skipped
-
-    def __post_init__(self) -> None:
-        check(self.env_steps >= 1, "train.env_steps", self.env_steps, "an integer >= 1")
-        for key in ("log_every", "checkpoint_every"):
-            check(getattr(self, key) > 0, f"train.{key}", getattr(self, key), "seconds > 0")
-        for key in ("keep", "devices", "max_skipped"):
-            check(1 <= getattr(self, key) <= 10**9, f"train.{key}", getattr(self, key), "an integer from 1 to 10^9")
+    prefix: ClassVar[str] = "train."
+    env_steps: int = Field(5_000_000, ge=1, description="Agent steps, of all environments together, to train for.")
+    init_from: str | None = Field(None, description="Run or agent whose parameters a new run begins with.")
+    log_every: float = Field(10.0, gt=0, description="Seconds between two rows of metrics.")
+    checkpoint_every: float = Field(60.0, gt=0, description="Seconds between two checkpoints.")
+    keep_checkpoints: int = Field(3, ge=1, le=10**9, description="How many of the newest checkpoints are kept.")
+    devices: int = Field(1, ge=1, le=10**9, description="Devices of each process, which share its environments.")
+    max_skipped: int = Field(20, ge=1, le=10**9, description="Not finite updates in a row that stop the run.")
+    dump_skipped: bool = Field(False, description="Keep the batches that such rows begin with, in <run>/skipped.")
 
 
-@dataclasses.dataclass(frozen=True)
-class DistributedConfig:
-    """The processes that share a run. SLURM's are found without any of this; other launchers state all three."""
+class DistributedConfig(Section):
+    """The processes that share a run. SLURM's are found without any of this; other launchers state the first three."""
 
-    coordinator: str | None = None  # host:port of process 0
-    processes: int | None = None
-    process: int | None = None  # this one's number, from 0
-    timeout: float = 180.0  # seconds to wait for the others before saving and ending; more than env.timeout
+    prefix: ClassVar[str] = "distributed."
+    coordinator: str | None = Field(None, description="Address of process 0, host:port.")
+    processes: int | None = Field(None, ge=1, description="How many processes share the run.")
+    process: int | None = Field(None, ge=0, description="This one's number, from 0.")
+    timeout: float = Field(
+        180.0, gt=0, description="Seconds to wait for others before the run saves and ends; more than env.timeout."
+    )
 
-    def __post_init__(self) -> None:
-        stated = [value is not None for value in (self.coordinator, self.processes, self.process)]
-        check(
-            all(stated) or not any(stated),
-            "distributed.coordinator, distributed.processes, distributed.process",
-            (self.coordinator, self.processes, self.process),
-            "a value for all three or for none",
-        )
-        if self.coordinator is not None and self.processes is not None and self.process is not None:
-            check_address("distributed.coordinator", self.coordinator)
-            check(self.processes >= 1, "distributed.processes", self.processes, "an integer >= 1")
-            accepted = f"an integer from 0 to {self.processes - 1}"
-            check(0 <= self.process < self.processes, "distributed.process", self.process, accepted)
-        check(self.timeout > 0, "distributed.timeout", self.timeout, "seconds > 0")
+    def check(self) -> None:
+        coordinator, processes, process = stated = (self.coordinator, self.processes, self.process)
+        if coordinator is None or processes is None or process is None:
+            if stated != (None, None, None):
+                names = "coordinator, distributed.processes, distributed.process"
+                raise refuse(names, stated, "a value for all three or for none")
+            return
+        check_address("coordinator", coordinator)
+        if process >= processes:
+            raise refuse("process", process, f"an integer from 0 to {processes - 1}")
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Section):
     """One run."""
 
-    name: str  # of the experiment, e.g. constant70
-    sensor: Sensor
-    game: str = "breakout"
-    seed: int = 0
-    run: str | None = None  # run directory; null for runs/<game>-<name>-s<seed>
-    profile: bool = False
-    gaze: GazeConfig = dataclasses.field(default_factory=GazeConfig)
+    name: Name = Field(description="Name of the experiment, e.g. constant70.")
+    sensor: Annotated[
+        Annotated[RingSensor, Tag("rings")] | Annotated[LogPolarSensor, Tag("logpolar")], Discriminator(_kind)
+    ]
+    game: Name = Field("breakout", description="An Atari game, seek, probe:<name>, or gymnasium:<id>.")
+    seed: int = Field(0, ge=0, le=2**31 - 10_001, description="Seed of environments, parameters and actions.")
+    run: str | None = Field(None, description="The run's directory; null for runs/<game>-<name>-s<seed>.")
+    profile: bool = Field(False, description="Trace some updates into <run>/profile in place of training.")
+    gaze: GazeConfig = GazeConfig()
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()
     train: TrainConfig = TrainConfig()
     distributed: DistributedConfig = DistributedConfig()
 
-    def __post_init__(self) -> None:
-        check(self.name.strip() != "", "name", repr(self.name), "the name of an experiment")
-        check(self.game.strip() != "", "game", repr(self.game), "the name of a game")
-        check(0 <= self.seed < 2**31 - 10_000, "seed", self.seed, "an integer from 0 to 2147473647")
-        height, width = self.env.frame_shape
-        if self.gaze.bounds == "window" or isinstance(self.sensor, RingSensor):
-            fits = self.sensor.window[0] <= height and self.sensor.window[1] <= width
-            check(
-                fits,
-                "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius",
-                self.sensor.window,
-                f"a focal area inside env.frame_shape={height}x{width}",
-            )
-        if isinstance(self.sensor, RingSensor) and self.sensor.peripheral is not None:
-            rows, columns = self.sensor.peripheral
-            check(
-                rows <= height and columns <= width,
-                "sensor.peripheral",
-                self.sensor.peripheral,
-                f"a grid no finer than env.frame_shape={height}x{width}",
-            )
-        if self.gaze.mode in ("learned", "random") and self.gaze.bounds == "window":
-            key = "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius"
-            accepted = f"point, or gaze=none: {key} fills env.frame_shape={height}x{width} and could not move"
-            check(self.sensor.window != (height, width), "gaze.bounds", self.gaze.bounds, accepted)
-        points = self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ())
-        for point in points:
-            check(
-                0 <= point[0] < height and 0 <= point[1] < width,
-                "gaze.start or gaze.path",
-                point,
-                f"[y, x] inside env.frame_shape={height}x{width}",
-            )
-        check(
-            self.env.num_envs % self.learner.minibatches == 0,
-            "learner.minibatches",
-            self.learner.minibatches,
-            f"a divisor of env.num_envs={self.env.num_envs}",
-        )
+    def check(self) -> None:
+        self._check_places()
+        self._check_minibatches()
         check_shares(self, self.train.devices, "train.devices", self.train.devices)
-        check(
-            self.learner.minibatches % self.env.groups == 0,
-            "env.groups",
-            self.env.groups,
-            f"a divisor of learner.minibatches={self.learner.minibatches}",
-        )
-        # Each environment's steps and the updates are counted in 32 bits.
-        rollouts = -(-self.train.env_steps // (self.env.num_envs * self.learner.rollout_length))
-        most = 2**31 // max(self.learner.rollout_length, self.learner.minibatches * self.learner.epochs) - 2
-        steps = most * self.env.num_envs * self.learner.rollout_length
-        accepted = f"at most {steps} with these learner.rollout_length, minibatches, epochs and env.num_envs"
-        check(rollouts <= most, "train.env_steps", self.train.env_steps, accepted)
+        self._check_counters()
+
+    def _check_places(self) -> None:
+        """The focal area, its grid and its points lie inside of the frame."""
+        height, width = self.env.frame_shape
+        frame = f"env.frame_shape={height}x{width}"
+        window, rings = self.sensor.window, isinstance(self.sensor, RingSensor)
+        key = "sensor.rings" if rings else "sensor.radius"
+        if (self.gaze.bounds == "window" or rings) and (window[0] > height or window[1] > width):
+            raise refuse(key, window, f"a focal area inside {frame}")
+        grid = getattr(self.sensor, "peripheral", None) or (1, 1)
+        if grid[0] > height or grid[1] > width:
+            raise refuse("sensor.peripheral", grid, f"a grid no finer than {frame}")
+        if self.gaze.mode in ("learned", "random") and self.gaze.bounds == "window" and window == (height, width):
+            accepted = f"point, or gaze=none: {key} fills {frame} and could not move"
+            raise refuse("gaze.bounds", self.gaze.bounds, accepted)
+        for y, x in self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ()):
+            if not (0 <= y < height and 0 <= x < width):
+                raise refuse("gaze.start or gaze.path", (y, x), f"[y, x] inside {frame}")
+
+    def _check_minibatches(self) -> None:
+        count, envs, groups = self.learner.num_minibatches, self.env.num_envs, self.env.num_groups
+        if envs % count:
+            raise refuse("learner.num_minibatches", count, f"a divisor of env.num_envs={envs}")
+        if count % groups:
+            raise refuse("env.num_groups", groups, f"a divisor of learner.num_minibatches={count}")
+
+    def _check_counters(self) -> None:
+        """Each environment's steps and the updates are counted in 32 bits."""
+        learner, rollout = self.learner, self.env.num_envs * self.learner.rollout_length
+        most = 2**31 // max(learner.rollout_length, learner.num_minibatches * learner.num_epochs) - 2
+        if -(-self.train.env_steps // rollout) > most:
+            keys = "learner.rollout_length, num_minibatches, num_epochs and env.num_envs"
+            raise refuse("train.env_steps", self.train.env_steps, f"at most {most * rollout} with these {keys}")
 
     @property
     def run_dir(self) -> str:
@@ -352,16 +332,33 @@ class Config:
 def check_address(key: str, value: str) -> None:
     """`ConfigError`, about `key`, unless `value` says where other processes find the first one."""
     host, _, port = value.rpartition(":")
-    check(host != "" and port.isdecimal(), key, value, "host:port of process 0")
+    if host == "" or not port.isdecimal():
+        raise refuse(key, value, "host:port of process 0")
 
 
 def check_shares(config: Config, shares: int, key: str, value: object) -> None:
     """`ConfigError`, about `key`, unless `shares` devices can each have the same part of a minibatch."""
-    size = config.env.num_envs // config.learner.minibatches
-    accepted = f"a divisor of the {size} environments of a minibatch (env.num_envs / learner.minibatches)"
-    check(size % shares == 0, key, value, accepted)
+    size = config.env.num_envs // config.learner.num_minibatches
+    if size % shares:
+        parts = "env.num_envs / learner.num_minibatches"
+        raise refuse(key, value, f"a divisor of the {size} environments of a minibatch ({parts})")
 
 
-def from_mapping(mapping: Mapping[str, Any]) -> Config:
-    """Builds a checked `Config` from plain nested mappings; raises `ConfigError`."""
-    return build(Config, mapping, "")
+def renamed(mapping: Mapping[str, Any], fixed: Collection[str] = ()) -> dict[str, Any]:
+    """A copy of nested mappings in which words of before are today's; those of today in `fixed` keep their values."""
+    found = copy.deepcopy(dict(mapping))
+    for old, new in RENAMED.items():
+        *path, word = old.split(".")
+        section: Any = found
+        for name in path:
+            section = section.get(name) if isinstance(section, dict) else None
+        if isinstance(section, dict) and word in section:
+            value = section.pop(word)
+            if new not in fixed:
+                section[new.rpartition(".")[2]] = value
+    return found
+
+
+def from_mapping(mapping: Any) -> Config:
+    """Builds a checked `Config` from plain nested mappings, words of before included; raises `ConfigError`."""
+    return build(Config, renamed(mapping) if isinstance(mapping, Mapping) else mapping)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -20,7 +20,7 @@ def experiments() -> Path:
     """The base of every configuration, and its groups."""
     directory = _find("experiments")
     if not (directory / "base.yaml").is_file():
-        raise ConfigError(f"{_PACKAGE}: experiments/base.yaml is missing; accepted is a checkout or a wheel")
+        raise refuse(str(_PACKAGE), accepted="a checkout or a wheel", why="experiments/base.yaml is missing")
     return directory
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.config.schema import Config
 from foajax.envs.atari import atari_game
 from foajax.envs.base import first_step
@@ -24,7 +24,7 @@ class AleEnvironment:
         from ale_py.vector_env import AtariVectorEnv
 
         if render:
-            raise ConfigError("env.engine=ale: accepted is envpool where screens are to be rendered in colour")
+            raise refuse("env.engine", "ale", "envpool where screens are to be rendered in colour")
         env = config.env
         game, self.crop_top = atari_game(config)
         self._env = AtariVectorEnv(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.config.schema import Config
 from foajax.envs.own import OWN
 
@@ -34,7 +34,7 @@ def atari_name(game: str, known: Iterable[str]) -> str:
         return names[game]
     near = difflib.get_close_matches(game.lower(), [*names, *OWN], n=3)
     hint = f"; near: {', '.join(near)}" if near else ""
-    raise ConfigError(f"game={game}: accepted is an Atari game (breakout), {', '.join(OWN)} or gymnasium:<id>{hint}")
+    raise refuse("game", game, f"an Atari game (breakout), {', '.join(OWN)} or gymnasium:<id>{hint}")
 
 
 def envpool_id(name: str) -> str:
@@ -65,8 +65,8 @@ def _crop_top(config: Config, game: str, known: Iterable[str]) -> int:
     env = config.env
     if env.frame_shape != FRAME_SHAPE:
         shape = list(env.frame_shape)
-        raise ConfigError(f"env.frame_shape={shape}: accepted is {list(FRAME_SHAPE)} for game={config.game}")
+        raise refuse("env.frame_shape", shape, f"{list(FRAME_SHAPE)} for game={config.game}")
     for key, row in env.crop_top.items():
         if key not in known and key != "default":
-            raise ConfigError(f"env.crop_top.{key}={row}: accepted is default or an Atari game in snake case")
+            raise refuse(f"env.crop_top.{key}", row, "default or an Atari game in snake case")
     return env.crop_top.get(game, env.crop_top["default"])

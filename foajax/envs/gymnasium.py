@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from foajax.config.parse import ConfigError, brief, one_line
+from foajax.config.parse import brief, one_line, refuse
 from foajax.config.schema import Config
 from foajax.types import Outcome, TimeStep
 
@@ -30,7 +30,7 @@ class GymnasiumEnvironment:
     def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
         name = config.game.removeprefix("gymnasium:")
         if name.count(":") > 1 or name.startswith(":"):
-            raise ConfigError(f"game={config.game}: accepted is gymnasium:<id> or gymnasium:<module>:<id>")
+            raise refuse("game", config.game, "gymnasium:<id> or gymnasium:<module>:<id>")
         make = functools.partial(gymnasium.make, name, disable_env_checker=True)
 
         def make_one() -> gymnasium.Env:
@@ -46,14 +46,14 @@ class GymnasiumEnvironment:
         try:
             self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
-            raise ConfigError(f"game={config.game}: accepted is the id of an environment ({one_line(error)})") from None
+            raise refuse("game", config.game, f"the id of an environment ({one_line(error)})") from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
         if not (is_pixels and isinstance(actions, spaces.Discrete)):
-            raise ConfigError(
-                f"game={config.game}: accepted is an environment with discrete actions and uint8 images "
-                f"[h, w], [h, w, 1] or [h, w, 3], not {brief(observations)} and {brief(actions)}"
-            )
+            images = "uint8 images [h, w], [h, w, 1] or [h, w, 3]"
+            spaces_here = f"{brief(observations)} and {brief(actions)}"
+            accepted = f"an environment with discrete actions and {images}, not {spaces_here}"
+            raise refuse("game", config.game, accepted)
         self.num_envs, self.num_actions = num_envs, int(actions.n)
         self._shape = config.env.frame_shape
         self._first_action, self._seed, self._clip = int(actions.start), seed, config.env.clip_rewards
@@ -103,7 +103,7 @@ def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
     """
     if images.dtype != np.uint8 or not (images.ndim == 3 or (images.ndim == 4 and images.shape[-1] in (1, 3))):
         accepted = "uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3]"
-        raise ValueError(f"images={images.dtype} {list(images.shape)}: accepted is {accepted}")
+        raise refuse("images", f"{images.dtype} {list(images.shape)}", accepted)
     if images.ndim == 4:
         images = (images @ LUMA + 500) // 1000 if images.shape[-1] == 3 else images[..., 0]
     rows, columns = (area_weights(*sizes) for sizes in zip(images.shape[1:], frame_shape, strict=True))

@@ -68,7 +68,7 @@ def environment_seed(seed: int, env_steps: int, group: int) -> int:
 
 def make_environments(config: Config, env_steps: int, index: int = 0, count: int = 1) -> list[Environment]:
     """The groups of environments of a run that starts at `env_steps`: process `index`'s part of each, of `count`."""
-    batch = config.env.num_envs // config.env.groups // count
+    batch = config.env.num_envs // config.env.num_groups // count
     # An engine adds an environment's number to its seed: each is seeded alike whatever the number of processes.
-    seeds = [environment_seed(config.seed, env_steps, group) + index * batch for group in range(config.env.groups)]
+    seeds = [environment_seed(config.seed, env_steps, group) + index * batch for group in range(config.env.num_groups)]
     return [make(config, num_envs=batch, seed=seed) for seed in seeds]

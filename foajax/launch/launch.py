@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from foajax import cli
-from foajax.config.compose import checked, compose, from_node, parse_override
-from foajax.config.parse import ConfigError, one_line
-from foajax.config.schema import Config
+from foajax.config import table
+from foajax.config.compose import checked, choices, compose, from_node, register
+from foajax.config.parse import one_line, refuse
+from foajax.config.schema import RENAMED, Config
 from foajax.config.shipped import experiments
 from foajax.launch import sweep
 from foajax.runs.directory import is_run
 from foajax.runs.status import is_finished
 
 Task = Callable[[Config], int | None]  # returns an exit code, None for 0
+_HELP = """Trains one agent: python -m foajax.train [key=value ...]
+
+Groups (group=choice), with more of your own from --config-dir=DIR:
+{groups}
+
+Keys (key=value), with their defaults:
+{keys}
+
+Flags: --multirun runs every combination of key=a,b,c, with --jobs=N so many at a time; --cfg job prints the keys of a
+run."""
+_MULTIRUN = {"-m", "--multirun"}
 
 
 def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None] = lambda config: None) -> int:
@@ -25,60 +37,90 @@ def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None]
 
     A single run is composed and started directly. `--multirun` alone runs a sweep on this machine, a process of
     `foajax.train` each, `--jobs=N` at a time (1). With a `hydra/launcher` (`submitit_slurm`; `basic` for one after
-    another in this process) Hydra starts `task` for each run, and other flags (`--help`, `--cfg`) are Hydra's. Every
-    run of a sweep is checked, by `check` too, before the first one starts; one that fails does not end the sweep.
+    another in this process) Hydra starts `task` for each run, and other flags (`--cfg`) are Hydra's. Every run of a
+    sweep is checked, by `check` too, before the first one starts; one that fails does not end the sweep.
 
     A `ConfigError`, one that `task` raises included, becomes one line on stderr and exit code 2.
     """
-    if any(word.startswith("-") for word in arguments):
-        return cli.run(functools.partial(_run_flags, task, check), arguments)
-    return cli.run(lambda words: task(compose(words)), arguments)
+    if not {"-h", "--help"}.isdisjoint(arguments):
+        return cli.run(lambda words: print(_help(_take_directory(words)[0])), arguments)
+    return cli.run(functools.partial(_run, task, check), arguments)
 
 
-def _run_flags(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) -> int:
+def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) -> int | None:
+    directory, arguments = _take_directory(arguments)
+    _name_new_words(arguments)
+    if not any(word.startswith("-") for word in arguments):
+        return task(compose(arguments, directory))
     ours = [word for word in arguments if "=" in word and not word.startswith(("-", "hydra.", "hydra/"))]
-    runs = sweep.expand(ours)
+    runs = sweep.expand(ours, directory)
     rest = [word for word in arguments if word not in ours]
-    is_sweep = not {"-m", "--multirun"}.isdisjoint(rest)
+    is_sweep = not _MULTIRUN.isdisjoint(rest)
     jobs = [word for word in rest if word.startswith("--jobs")]
     at_a_time = _jobs(*jobs)
     if is_sweep:
         if strays := [word for word in rest if not word.startswith(("-", "hydra.", "hydra/"))]:
-            raise ConfigError(f"{one_line(strays[0])}: accepted is key=value")
+            raise refuse(one_line(strays[0]))
         for each in runs:
             check(each.config)
-    if is_sweep and not set(rest) - {"-m", "--multirun", *jobs}:
-        return sweep.run_all(runs, jobs=at_a_time)
+    flag = [] if directory is None else [f"--config-dir={directory}"]
+    if is_sweep and not set(rest) - {*_MULTIRUN, *jobs}:
+        return sweep.run_all(runs, jobs=at_a_time, command=(*sweep.COMMAND, *flag))
     if jobs:
-        raise ConfigError(f"{jobs[0]}: accepted only together with --multirun, and without a hydra/launcher")
+        raise refuse(jobs[0], accepted="the same with --multirun, and without a hydra/launcher")
     failures: dict[str, str] = {}
-    swept = (
-        {parse_override(word).key_or_group for word in ours if parse_override(word).is_sweep_override()}
-        if is_sweep
-        else None
-    )
-    words = [checked(word, sweep=True) if word in ours else word for word in arguments]
-    code = _run_hydra(lambda node: _job(task, swept, failures, node), words)
+    swept = sweep.swept_by(ours) if is_sweep else None
+    theirs = [word for word in rest if word.startswith(("hydra.", "hydra/"))]  # after flags: its parser wants it so
+    words = [*theirs, *(checked(word, sweep=True, config_dir=directory) for word in ours)]
+    flags = [word for word in rest if word not in theirs]
+    code = _run_hydra(lambda node: _job(task, swept, failures, node), [*flags, *flag, *words])
     return sweep.summarise([run.config for run in runs], failures) or code if is_sweep else code
+
+
+def _take_directory(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """The directory of `--config-dir`, where choices of one's own are, and the other words."""
+    words = list(arguments)
+    for i, word in enumerate(words):
+        flag, is_joined, value = word.partition("=")
+        if flag in ("--config-dir", "-cd"):
+            end = i + (1 if is_joined else 2)
+            directory = Path(value if is_joined else "".join(words[i + 1 : end])).absolute()
+            if not directory.is_dir() or end > len(words):
+                raise refuse(f"{flag}={value}", accepted="a directory with experiment/, sensor/, network/, learner/")
+            return directory, words[:i] + words[end:]
+    return None, words
+
+
+def _name_new_words(arguments: Sequence[str]) -> None:
+    for word in arguments:
+        key = word.lstrip("+").partition("=")[0]
+        if key in RENAMED:
+            print(f"foajax: {key} is now {RENAMED[key]}", file=sys.stderr)
+
+
+def _help(directory: Path | None) -> str:
+    offered = "\n".join(f"  {group}: {', '.join(names)}" for group, names in choices(directory).items())
+    return _HELP.format(groups=offered, keys=table.listed(Config))
 
 
 def _jobs(word: str = "--jobs=1", *more: str) -> int:
     number = word.partition("=")[2]
     if more or not number.isdecimal() or int(number) < 1:
-        raise ConfigError(f"{one_line(word, *more)}: accepted is --jobs=N, how many runs at a time")
+        raise refuse(one_line(word, *more), accepted="--jobs=N, how many runs at a time")
     return int(number)
 
 
-def _job(task: Task, swept: set[str] | None, failures: dict[str, str], node: Any) -> None:
+def _job(task: Task, swept: Mapping[str, str] | None, failures: dict[str, str], node: Any) -> None:
     """One run that Hydra starts, maybe in another process; `swept` are the keys of a sweep."""
     from hydra.core.hydra_config import HydraConfig
 
-    config = from_node(node)
+    words = HydraConfig.get().overrides.task
+    config = from_node(node, words)
     if swept is None:
         if code := cli.run(lambda _: task(config), ()):
             raise SystemExit(code)  # Hydra drops what a job returns
         return
-    config = sweep.named(config, HydraConfig.get().overrides.task, swept)
+    config = sweep.named(config, words, swept)
     if sweep.skip_if_finished(config):
         return
     try:
@@ -102,6 +144,7 @@ def _is_left(config: Config) -> bool:
 def _run_hydra(job: Callable[[Any], None], words: Sequence[str]) -> int:
     import hydra
 
+    register()
     before = sys.argv
     sys.argv = [before[0], *words]  # hydra.main takes its arguments from nowhere else
     try:

@@ -30,7 +30,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxlib import _jax
 
-from foajax.config.parse import ConfigError, flatten, one_line, to_mapping
+from foajax.config.parse import ConfigError, flatten, one_line, refuse, to_mapping
 from foajax.config.schema import Config, check_address, check_shares
 from foajax.launch import coordinator
 
@@ -106,9 +106,9 @@ class Job:
         others = np.flatnonzero(self.gather(np.array([bool(differ)])))
         if differ:
             key = differ[0]
-            raise ConfigError(f"{key}={settings.get(key)}: accepted is {first.get(key)}, as in process 0")
+            raise refuse(key, settings.get(key), f"{first.get(key)}, as in process 0")
         if others.size:
-            raise ConfigError(f"process {others[0]}: has another configuration; accepted is that of process 0")
+            raise refuse(f"process {others[0]}", accepted="that of process 0", why="has another configuration")
 
     def by_first(self, name: str, task: Callable[[], T]) -> T | None:
         """What process 0 gets from `task`, None in the others; its `ConfigError` is raised in all."""
@@ -144,7 +144,7 @@ def start(config: Config) -> Job:
                 )
         except (RuntimeError, ValueError) as error:
             reason = one_line(error)[:200]
-            raise ConfigError(f"distributed={others}: accepted is what all processes can reach ({reason})") from None
+            raise refuse("distributed", others, f"what all processes can reach ({reason})") from None
     return Job(config)
 
 
@@ -180,7 +180,7 @@ def where(config: Config) -> dict[str, Any] | None:
             count, index = (int(os.environ[f"JAX_{name}"]) for name in ("NUM_PROCESSES", "PROCESS_ID"))
         except (KeyError, ValueError):
             names = "JAX_NUM_PROCESSES and JAX_PROCESS_ID, integers, beside JAX_COORDINATOR_ADDRESS"
-            raise ConfigError(f"distributed: accepted is {names}") from None
+            raise refuse("distributed", accepted=names) from None
         check_address("JAX_COORDINATOR_ADDRESS", os.environ["JAX_COORDINATOR_ADDRESS"])
         return {"num_processes": count, "process_id": index, "cluster_detection_method": "deactivate"}
     # A step of one task is a run of its own, whatever the job around it holds.
@@ -194,7 +194,7 @@ def _local_devices(config: Config) -> list[jax.Device]:
     wanted, there = config.train.devices, jax.local_devices()
     if wanted > len(there):
         hint = " (JAX_NUM_CPU_DEVICES=N makes a CPU look like N)" if there[0].platform == "cpu" else ""
-        raise ConfigError(f"train.devices={wanted}: accepted is up to {len(there)} here, {there[0].platform}{hint}")
+        raise refuse("train.devices", wanted, f"up to {len(there)} here, {there[0].platform}{hint}")
     return there[:wanted]
 
 

@@ -7,7 +7,6 @@ nevertheless. A signal goes on to the running processes, which save; no further 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import os
 import re
@@ -22,12 +21,13 @@ from types import FrameType
 from typing import NamedTuple
 
 from foajax.config.compose import choices, compose, parse_override
-from foajax.config.parse import ConfigError, one_line
-from foajax.config.schema import Config
+from foajax.config.parse import one_line, refuse, replace
+from foajax.config.schema import RENAMED, Config
 from foajax.launch.signals import STOPS
 from foajax.runs.directory import failure, forget_failure
 from foajax.runs.status import is_finished
 
+COMMAND = (sys.executable, "-m", "foajax.train")
 _POLL = 0.1  # seconds between two looks at the running processes
 _OUTPUT = "output.txt"  # of a run beside others, in its directory
 
@@ -68,7 +68,7 @@ class _Stop:
                 process.send_signal(number)
 
 
-def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = (sys.executable, "-m", "foajax.train")) -> int:
+def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = COMMAND) -> int:
     """Runs `command` with each run's words, `jobs` at a time; 0 unless one failed.
 
     One at a time, a run has the terminal and the machine; beside others it writes to ``output.txt`` in its directory
@@ -175,32 +175,38 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def expand(words: Sequence[str]) -> list[Run]:
+def expand(words: Sequence[str], config_dir: Path | None = None) -> list[Run]:
     """Every run of a sweep, checked, so that a mistake in the last one does not show hours later."""
-    swept = {parse_override(word).key_or_group for word in words if parse_override(word).is_sweep_override()}
+    swept = swept_by(words)
     runs: dict[str, Run] = {}
-    for overrides in itertools.product(*map(_values, words)):
-        plain = compose(overrides)
+    for overrides in itertools.product(*(_values(word, config_dir) for word in words)):
+        plain = compose(overrides, config_dir)
         config = named(plain, overrides, swept)
         if config.run_dir in runs:
             accepted = "a directory for each, as with 'name=constant70-${gaze.mode}'"
-            raise ConfigError(f"run={config.run_dir}: two runs would share it; accepted is {accepted}")
+            raise refuse("run", config.run_dir, accepted, why="two runs would share it")
         name = [] if config == plain else [f"name='{config.name}'"]
         runs[config.run_dir] = Run((*overrides, *name), config)
     return list(runs.values())
 
 
-def named(config: Config, overrides: Iterable[str], swept: set[str]) -> Config:
+def swept_by(words: Sequence[str]) -> dict[str, str]:
+    """The keys of which a sweep tries several values, as they were typed, by those words and by today's."""
+    typed = [override.key_or_group for override in map(parse_override, words) if override.is_sweep_override()]
+    return {**{key: key for key in typed}, **{RENAMED[key]: key for key in typed if key in RENAMED}}
+
+
+def named(config: Config, overrides: Iterable[str], swept: Mapping[str, str]) -> Config:
     """`config` with a name that tells what the sweep chose, unless the choices name the directory already."""
     known = {"experiment", "game", "seed", "name", "run"}
     parsed = {override.key_or_group: override for override in map(parse_override, overrides)}
     if {"name", "run"} & parsed.keys():
         return config
-    chosen = [f"{key}={parsed[key].get_value_string()}" for key in parsed if key in swept - known]
-    return dataclasses.replace(config, name="-".join([config.name, *(re.sub(r"[^\w.=+-]+", "-", c) for c in chosen)]))
+    chosen = [f"{swept[key]}={parsed[key].get_value_string()}" for key in parsed if key in swept.keys() - known]
+    return replace(config, name="-".join([config.name, *(re.sub(r"[^\w.=+-]+", "-", c) for c in chosen)]))
 
 
-def _values(word: str) -> Iterable[str]:
+def _values(word: str, config_dir: Path | None) -> Iterable[str]:
     """The single overrides that one override of a sweep stands for."""
     from hydra.core.override_parser.types import Glob
 
@@ -209,10 +215,10 @@ def _values(word: str) -> Iterable[str]:
     if not override.is_sweep_override():
         return [word]
     if isinstance(value, Glob):
-        names = choices().get(key, ())
+        names = choices(config_dir).get(key, ())
         if not (chosen := value.filter(list(names))):
-            raise ConfigError(f"{one_line(word)}: accepted is what matches one of {', '.join(names) or 'no names'}")
+            raise refuse(one_line(word), accepted=f"what matches one of {', '.join(names) or 'no names'}")
         return [f"{key}={choice}" for choice in chosen]
     if not override.is_discrete_sweep():
-        raise ConfigError(f"{one_line(word)}: accepted is a list of values")
+        raise refuse(one_line(word), accepted="a list of values")
     return [f"{key}={choice}" for choice in override.sweep_string_iterator()]

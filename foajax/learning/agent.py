@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, UInt8
 
+from foajax.config.parse import refuse
 from foajax.config.schema import Config, RingSensor
 from foajax.learning.losses import log_prob
 from foajax.networks import network as networks
@@ -131,7 +132,7 @@ class Agent:
         shape = self.config.env.frame_shape if self.crop_top is None else SCREEN_SHAPE
         if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
             accepted = f"uint8 [B, {shape[0]}, {shape[1]}], gray"
-            raise ValueError(f"frame={screen.dtype} {list(screen.shape)}: accepted is {accepted}")
+            raise refuse("frame", f"{screen.dtype} {list(screen.shape)}", accepted)
         return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
 
     def normalise(self, frame: Float[Array, "B H W"], statistics: FrameStatistics) -> Float[Array, "B H W"]:

@@ -173,7 +173,7 @@ def _head_loss(
     )
     error = losses.value_loss(value, target)
     entropy = losses.entropy(logits)
-    total = acts(policy - head.beta * entropy, reduction=config.reduction)
+    total = acts(policy - head.entropy_weight * entropy, reduction=config.reduction)
     total += config.value_weight * values(error, reduction=config.reduction)
     log_ratio = losses.log_prob(logits, action) - behaviour_log_prob
     metrics = {

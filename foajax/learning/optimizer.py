@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.config.schema import LearnerConfig
 from foajax.types import Params
 
@@ -37,7 +37,7 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
     below 1.
     """
     if total_updates < 1:
-        raise ConfigError(f"total_updates={total_updates}: accepted is an integer >= 1")
+        raise refuse("total_updates", total_updates, "an integer >= 1")
 
     def schedule(count):
         rate: Array | float = learner.learning_rate

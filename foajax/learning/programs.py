@@ -35,7 +35,7 @@ def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
     """
     config = agent.config
     optimizer = make_optimizer(config.learner, total_updates(agent))
-    size = config.env.num_envs // config.learner.minibatches
+    size = config.env.num_envs // config.learner.num_minibatches
     act = functools.partial(_act, agent)
     if layout is None:
         update = functools.partial(learner.update, agent, optimizer, size)
@@ -71,7 +71,7 @@ def total_updates(agent: Agent) -> int:
     """Minibatch updates until `train.env_steps`, for the learning-rate schedule."""
     config = agent.config
     rollouts = -(-config.train.env_steps // (config.env.num_envs * config.learner.rollout_length))
-    return rollouts * config.learner.minibatches * config.learner.epochs
+    return rollouts * config.learner.num_minibatches * config.learner.num_epochs
 
 
 def make_state(agent: Agent, seed: int) -> TrainState:

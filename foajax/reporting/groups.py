@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.parse import flatten, refuse, to_mapping
 from foajax.reporting.curves import RunData
 from foajax.reporting.scores import Interval, interval, iqm, normalised
 from foajax.runs.directory import FREE
@@ -43,16 +43,15 @@ def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
         if preset is None or base in PRESETS[preset]:
             games.setdefault(run.config.game, {}).setdefault(_label(run.config.name, preset), []).append(run)
     if not games:
-        raise ConfigError(f"preset={preset}: accepted are runs of {', '.join(PRESETS[str(preset)])}")
+        raise refuse("preset", preset, f"runs of {', '.join(PRESETS[str(preset)])}")
     for groups in games.values():
         for name, seeds in groups.items():
             if differences := differing_keys(seeds):
                 key, values = next(iter(differences.items()))
                 other = next(run for run, value in zip(seeds, values, strict=True) if value != values[0])
-                raise ConfigError(
-                    f"{other.path}: {name} differs in {key} from that of {seeds[0].path}; "
-                    "accepted are runs that differ in their seeds alone, or in their names"
-                )
+                accepted = "a set of runs that differ in their seeds alone, or in their names"
+                why = f"{name} differs in {key} from that of {seeds[0].path}"
+                raise refuse(str(other.path), accepted=accepted, why=why)
     if preset is None:
         return games
     order = [_label(name + suffix, preset) for name in PRESETS[preset] for suffix in ("", "_packed")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shlex
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import yaml
 
 from foajax.config import shipped
-from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.parse import refuse, replace, to_mapping
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.reporting.groups import games_of
 from foajax.runs.status import newest_checkpoint
@@ -31,13 +30,13 @@ def keep(path: Path, name: str | None) -> Path:
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"evaluate run={path} json={path}/score.json"
-        raise ConfigError(f"run={path}: its score.json has {found}; accepted is {wanted}, as {command} writes it")
-    config = dataclasses.replace(run.config, run=None)
+        raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
+    config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
     out = KEPT / game / (name or f"{config.name}-s{config.seed}")
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     if out.exists() and (out / "config.yaml").read_text() != text:
-        raise ConfigError(f"name={out.name}: holds another run; accepted is another name=<name>-s<seed>")
+        raise refuse("name", out.name, "another name=<name>-s<seed>", why="holds another run")
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(text)
     rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)

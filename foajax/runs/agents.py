@@ -5,7 +5,6 @@ A run directory and a shipped agent are read alike.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.config.parse import ConfigError, flatten, refuse, replace, to_mapping
 from foajax.config.schema import Config
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_state
@@ -66,9 +65,9 @@ def load_agent(path: str | Path, *, best: bool = False) -> Stored:
         facts = json.loads((path / FACTS).read_text())
         agent = Agent(config, facts["num_actions"], facts["crop_top"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"run={path}: {FACTS} is missing or not readable; accepted is a run or an agent") from None
+        raise refuse("run", path, "a run or an agent", why=f"{FACTS} is missing or not readable") from None
     if not isinstance(agent.num_actions, int) or agent.num_actions < 1:
-        raise ConfigError(f"run={path}: {FACTS} has num_actions={agent.num_actions}; accepted is an integer >= 1")
+        raise refuse("run", path, "an integer >= 1", why=f"{FACTS} has num_actions={agent.num_actions}")
     if (path / PARAMETERS).exists():
         return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
     template = jax.eval_shape(lambda: make_state(agent, 0))
@@ -106,7 +105,7 @@ def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
             accepted = (
                 f"an agent with this run's sensor, network, gaze and number of actions; {_differences(stored, config)}"
             )
-            raise ConfigError(f"{key}: {name} has the shape {have}, here it is {want}; accepted is {accepted}")
+            raise refuse(key, accepted=accepted, why=f"{name} has the shape {have}, here it is {want}")
     params, statistics = jax.tree.map(jnp.asarray, (stored.params, stored.statistics))
     return state._replace(params=params, statistics=statistics)
 
@@ -126,8 +125,8 @@ def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None 
       ConfigError: `directory` is a run's, or cannot be written.
     """
     if is_run(directory):
-        raise ConfigError(f"out={directory}: is a run; accepted is another directory")
-    config = to_mapping(dataclasses.replace(stored.agent.config, run=None))  # where it was trained does not matter
+        raise refuse("out", directory, "another directory", why="is a run")
+    config = to_mapping(replace(stored.agent.config, run=None))  # where it was trained does not matter
     known = {} if score is None else {"score": dict(score)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -135,7 +134,7 @@ def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None 
         (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
         save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
     except (OSError, SafetensorError) as error:
-        raise ConfigError(f"out={directory}: accepted is a directory that can be written ({error})") from None
+        raise refuse("out", directory, f"a directory that can be written ({error})") from None
 
 
 def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:

@@ -11,7 +11,6 @@ Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (ch
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import os
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from foajax.config.parse import ConfigError, flatten, one_line, to_mapping
+from foajax.config.parse import ConfigError, flatten, one_line, refuse, replace, to_mapping
 from foajax.config.schema import Config, from_mapping
 from foajax.runs import durable
 from foajax.runs.lock import RunError, reason_of, take_lock
@@ -42,7 +41,7 @@ _BEFORE = {
 # What may change between two starts of a run: none of it changes what a step learns.
 FREE = {
     *("run", "profile", "env.threads", "env.timeout"),
-    *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep"),
+    *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep_checkpoints"),
     *("train.max_skipped", "train.dump_skipped"),
     *("train.devices", *(f"distributed.{key}" for key in ("coordinator", "processes", "process", "timeout"))),
 }
@@ -89,12 +88,12 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
     try:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise RunError(f"run={path}: is a file; accepted is a directory") from None
+        raise refuse("run", path, "a directory", why="is a file", kind=RunError) from None
     except (OSError, ValueError) as error:
         raise RunError(f"run={path}: cannot be created ({reason_of(error)}); choose another run=<dir>") from None
     if os.path.lexists(path / PARAMETERS):
         accepted = f"another run=<dir>, with train.init_from={path} to begin from its parameters"
-        raise RunError(f"run={path}: is a shipped agent; accepted is {accepted}")
+        raise refuse("run", path, accepted, why="is a shipped agent", kind=RunError)
     run_dir = RunDir(path, take_lock(path))
     try:
         _settle_config(path, config)
@@ -136,14 +135,14 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     except (FileNotFoundError, NotADirectoryError):
         there = f"has no {_CONFIG}" if os.path.isdir(path) else "is a file"
         what = there if os.path.exists(path) else "does not exist"
-        raise RunError(f"run={path}: {what}; accepted is the directory of a run") from None
+        raise refuse("run", path, "the directory of a run", why=what, kind=RunError) from None
     except ConfigError as error:
         raise RunError(f"{file}: {error}") from None
     except OSError as error:
         raise RunError(f"{file}: cannot be read ({reason_of(error)})") from None
     except Exception as error:  # a file of any content ends up here
         raise RunError(f"{file}: is not the configuration of a run ({reason_of(error)})") from None
-    return dataclasses.replace(config, run=str(path))
+    return replace(config, run=str(path))
 
 
 def is_run(path: Path) -> bool:

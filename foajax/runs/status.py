@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.runs.directory import check_same_run, describe_error, failure, is_run, load_config
 from foajax.runs.lock import is_held
@@ -63,7 +63,7 @@ def find_runs(directories: Sequence[str | os.PathLike[str]]) -> list[Path]:
     found: set[Path] = set()
     for directory in directories:
         if not os.path.isdir(directory):
-            raise ConfigError(f"{directory}: accepted is a directory with runs")
+            raise refuse(str(directory), accepted="a directory with runs")
         for parent, below, _ in os.walk(directory):
             if is_run(Path(parent)):
                 found.add(Path(parent))

@@ -12,6 +12,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
+from foajax.config.parse import refuse
 from foajax.types import FrameStatistics
 
 DECAY = 0.9999  # of the running statistics, per frame
@@ -52,7 +53,7 @@ def crop_and_halve(screen: UInt8[Array, "210 160"], crop_top: int) -> Float[Arra
       ValueError: if the crop leaves the screen.
     """
     if not 0 <= crop_top <= screen.shape[0] - CROPPED:
-        raise ValueError(f"crop_top={crop_top}: accepted is a row from 0 to {screen.shape[0] - CROPPED}")
+        raise refuse("crop_top", crop_top, f"a row from 0 to {screen.shape[0] - CROPPED}")
     # Strided slices of 16-bit integers: XLA on the CPU turns a reshape with a sum, reduce_window or
     # a product with a pooling matrix into code that is 5 to 40 times slower.
     kept = screen[crop_top : crop_top + CROPPED].astype(jnp.uint16)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.config.schema import Config, GazeConfig
 
 Shape = tuple[int, int]  # rows, columns
@@ -64,7 +64,7 @@ def scripted(age: Int[Array, ""], *, gaze: GazeConfig, window: Shape, frame_shap
       ConfigError: an empty path.
     """
     if not gaze.path:
-        raise ConfigError("gaze.path=[]: accepted is at least one [y, x]")
+        raise refuse("gaze.path", gaze.path, "at least one [y, x]")
     return _clip(jnp.asarray(gaze.path)[age % len(gaze.path)], gaze, window, frame_shape)
 
 
@@ -79,9 +79,7 @@ def limits(*, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> tuple[np.n
     size = np.array(window, np.int32)
     low, high = size // 2, np.array(frame_shape, np.int32) - (size - size // 2)
     if (low > high).any():
-        raise ConfigError(
-            f"gaze.bounds=window: accepted is 'point' where the focal area {window} exceeds {frame_shape}"
-        )
+        raise refuse("gaze.bounds", "window", f"'point' where the focal area {window} exceeds {frame_shape}")
     return low, high
 
 

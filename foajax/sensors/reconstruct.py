@@ -7,7 +7,6 @@ whoever draws them, in whatever language, needs two tables.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
+from foajax.config.parse import replace
 from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
 from foajax.sensors import logpolar
 from foajax.sensors.rings import canvas
@@ -61,7 +61,7 @@ class Painting(NamedTuple):
 
 def packed(sensor: Sensor) -> Sensor:
     """The sensor that gives the same values, each once."""
-    return dataclasses.replace(sensor, layout="packed") if isinstance(sensor, RingSensor) else sensor
+    return replace(sensor, layout="packed") if isinstance(sensor, RingSensor) else sensor
 
 
 def tables(sensor: Sensor, frame_shape: tuple[int, int]) -> Painting:

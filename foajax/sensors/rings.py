@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.config.schema import RingSensor
 from foajax.sensors.window import Shape, place
 
@@ -36,7 +36,7 @@ def sense_cells(frame: Num[Array, "H W"], sensor: RingSensor) -> Float[Array, "r
     rows, columns = cell_edges(sensor, (height, width))
     if not (np.diff(rows).all() and np.diff(columns).all()):
         accepted = f"a grid no finer than the frame, {height}x{width}"
-        raise ConfigError(f"sensor.peripheral={sensor.peripheral}: accepted is {accepted}")
+        raise refuse("sensor.peripheral", sensor.peripheral, accepted)
     if sensor.pooling == "stride":
         return frame[rows[:-1]][:, columns[:-1]].astype(jnp.float32)
     # Whole columns of the product are contiguous sums; 'highest' keeps accelerators from rounding.

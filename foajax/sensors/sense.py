@@ -12,7 +12,6 @@ the frame, except where every pixel of the frame matters: a canvas, a peripheral
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from typing import NamedTuple
@@ -23,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse, replace
 from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
 from foajax.sensors import logpolar
 from foajax.sensors.rings import (
@@ -82,22 +81,20 @@ def sense(
         the frame; other bounds, or 'window' and an area larger than the frame.
     """
     if bounds not in ("window", "point"):
-        raise ConfigError(f"bounds={bounds}: accepted is 'window' or 'point'")
+        raise refuse("bounds", bounds, "'window' or 'point'")
     frame, focal_point = jnp.asarray(frame), jnp.asarray(focal_point)
     if not jnp.issubdtype(focal_point.dtype, jnp.integer):
-        raise ConfigError(
-            f"focal_point={focal_point.dtype}: accepted is integers, which foajax.sensors.gaze.from_unit makes"
-        )
+        raise refuse("focal_point", focal_point.dtype, "integers, which foajax.sensors.gaze.from_unit makes")
     if focal_point.shape != (2,):
-        raise ConfigError(f"focal_point={list(focal_point.shape)}: accepted is (y, x), jax.vmap for more")
+        raise refuse("focal_point", list(focal_point.shape), "(y, x), jax.vmap for more")
     if frame.ndim not in (2, 3):
-        raise ConfigError(f"frame={list(frame.shape)}: accepted is [H, W] or [H, W, C], jax.vmap for more")
+        raise refuse("frame", list(frame.shape), "[H, W] or [H, W, C], jax.vmap for more")
     corner = focal_point - np.array(sensor.window) // 2
     if bounds == "window":
         room = np.array(frame.shape[:2]) - sensor.window
         if (room < 0).any():
             accepted = f"'point' where the focal area {sensor.window} exceeds {frame.shape[:2]}"
-            raise ConfigError(f"bounds=window: accepted is {accepted}")
+            raise refuse("bounds", "window", accepted)
         corner = jnp.clip(corner, 0, room)
     gray = functools.partial(_sense_gray, corner=corner, sensor=sensor, inside=bounds == "window")
     if frame.ndim == 2:
@@ -129,7 +126,7 @@ def pixel_count(sensor: Sensor, frame_shape: Shape) -> PixelCount:
     for height, width, factor in sensor.rings:
         nominal += (height * width - inner) / factor**2
         inner = height * width
-    shapes = image_shapes(dataclasses.replace(sensor, layout="packed"), frame_shape)
+    shapes = image_shapes(replace(sensor, layout="packed"), frame_shape)
     actual = sum(math.prod(shape) for shape in shapes) - sum(int(h.sum()) for h in hidden_blocks(sensor))
     if sensor.peripheral is not None:
         least = centred = 1  # cells hidden along one axis, times those along the other

@@ -25,7 +25,7 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float, Int, Num, UInt32
 
 from foajax.config.compose import compose
-from foajax.config.parse import ConfigError, brief
+from foajax.config.parse import refuse, replace
 from foajax.config.schema import Config, EnvConfig, GazeConfig, Sensor
 from foajax.sensors import gaze as gazes
 from foajax.sensors.sense import image_shapes, sense
@@ -106,7 +106,7 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
         super().__init__(env)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
-            raise ConfigError(f"autoreset_mode={mode}: accepted is AutoresetMode.NEXT_STEP or DISABLED")
+            raise refuse("autoreset_mode", mode, "AutoresetMode.NEXT_STEP or DISABLED")
         self._restarts = mode == AutoresetMode.NEXT_STEP
         self._eye = _Eye.of(env.single_observation_space, sensor, gaze)
         self._single_observation_space = self._eye.observation_space
@@ -162,17 +162,17 @@ class _Eye:
         box = _pixels(space)
         if isinstance(sensor, str):
             experiment = compose([f"experiment={sensor}"])
-            sensor, gaze = experiment.sensor, gaze or dataclasses.replace(experiment.gaze, mode="learned")
+            sensor, gaze = experiment.sensor, gaze or replace(experiment.gaze, mode="learned")
         gaze = gaze or GazeConfig()
         if not isinstance(sensor, Sensor):
-            raise ConfigError(f"sensor={sensor}: accepted is a RingSensor, a LogPolarSensor or an experiment's name")
+            raise refuse("sensor", sensor, "a RingSensor, a LogPolarSensor or an experiment's name")
         if not isinstance(gaze, GazeConfig):
-            raise ConfigError(f"gaze={gaze}: accepted is a GazeConfig")
+            raise refuse("gaze", gaze, "a GazeConfig")
         if not gaze.learned:
-            raise ConfigError(f"gaze.mode={gaze.mode}: accepted is learned, for visual actions from outside")
+            raise refuse("gaze.mode", gaze.mode, "learned, for visual actions from outside")
         # What a run is checked for, a wrapped environment is checked for too. But the whole frame may be a baseline
         # here, which a gaze that has to move is refused.
-        still = dataclasses.replace(gaze, mode="frozen")
+        still = replace(gaze, mode="frozen")
         Config(name="wrapper", sensor=sensor, gaze=still, env=EnvConfig(frame_shape=(box.shape[0], box.shape[1])))
         return cls(box=box, sensor=sensor, gaze=gaze)
 
@@ -195,7 +195,7 @@ class _Eye:
         known = action.shape == shape and np.issubdtype(action.dtype, np.integer)
         if not known or (action < 0).any() or (action >= self.gaze.actions).any():
             accepted = f"integers {list(shape)} from 0 to {self.gaze.actions - 1}"
-            raise ValueError(f"vision={brief(action)}: accepted is {accepted}")
+            raise refuse("vision", action, accepted)
         return action.astype(np.int32)
 
     @property
@@ -242,4 +242,4 @@ def _pixels(space: gymnasium.Space) -> spaces.Box:
         if number and (len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[2] in (1, 3))):
             return space
     accepted = "a Box of uint8 or float pixels, [H, W], [H, W, 1] or [H, W, 3]"
-    raise ConfigError(f"observation_space={brief(space)}: accepted is {accepted}")
+    raise refuse("observation_space", space, accepted)

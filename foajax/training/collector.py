@@ -26,9 +26,9 @@ def update_on(
 ) -> tuple[TrainState, list[Metrics]]:
     """All minibatches of the groups' rollouts, `epochs` times, one after another; nothing is waited for."""
     metrics = []
-    for epoch in range(learner.epochs):
+    for epoch in range(learner.num_epochs):
         for rollout in rollouts:
-            for index in range(learner.minibatches // len(rollouts)):
+            for index in range(learner.num_minibatches // len(rollouts)):
                 state, row = programs.update(state, rollout, np.int32(index), np.bool_(epoch == 0))
                 metrics.append(row)
     return state, metrics

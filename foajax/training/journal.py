@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.learning.learner import Metrics, explained_variance
 from foajax.runs.logger import Logger
 from foajax.training.episodes import EpisodeTracker
@@ -78,11 +78,10 @@ def check_finite(metrics: Sequence[Metrics], max_skipped: int, env_steps: int) -
     if int(last["skipped_in_a_row"]) < max_skipped:
         return
     values = ", ".join(f"{name} {float(last[name]):.4g}" for name in ("loss", "grad_norm", "param_norm"))
-    raise ConfigError(
-        f"train.max_skipped={max_skipped}: so many updates in a row were not finite ({values}); the last good "
-        f"parameters are saved at {env_steps:,} env_steps; accepted is another run=<dir>, with a "
-        "smaller learner.learning_rate or learner.max_grad_norm"
-    )
+    saved = f"the last good parameters are saved at {env_steps:,} env_steps"
+    why = f"so many updates in a row were not finite ({values}); {saved}"
+    accepted = "another run=<dir>, with a smaller learner.learning_rate or learner.max_grad_norm"
+    raise refuse("train.max_skipped", max_skipped, accepted, why=why)
 
 
 def is_blind(means: Mapping[str, float], num_actions: int) -> bool:

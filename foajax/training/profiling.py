@@ -118,7 +118,7 @@ def _print(config: Config, stopwatch: Stopwatch, total: float, flops: Mapping[st
         calls = str(stopwatch.calls[part]) if part in stopwatch.calls else ""
         row = [part, f"{100 * seconds / total:.1f} %", f"{1e6 * seconds / env_steps:.1f}", calls]
         if part in flops:
-            work = flops[part] * (config.learner.epochs if part == "update" else 1)
+            work = flops[part] * (config.learner.num_epochs if part == "update" else 1)
             row += [f"{work / 1e6:.1f}", f"{work * env_steps / seconds / 1e9:.0f}", f"{1e6 * work / rate:.1f}"]
         table.add_row(*row)
     table.add_row("all", "100 %", f"{1e6 * total / env_steps:.1f}", end_section=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.envs.atari import is_atari
 from foajax.envs.base import Environment
@@ -102,7 +102,7 @@ class Run:
         self._journal.say(f"{run_dir.path}: {self._how_it_starts()}")
         if not config.train.dump_skipped:
             return None
-        return Dump(run_dir.path / "skipped", minibatches=config.learner.minibatches, warn=self._journal.warn)
+        return Dump(run_dir.path / "skipped", minibatches=config.learner.num_minibatches, warn=self._journal.warn)
 
     def loop(self, stop: StopRequest) -> None:
         """Rollouts and updates until `train.env_steps` or a request to stop; saves in the end, whatever ends it."""
@@ -235,7 +235,7 @@ class Run:
 
     def _unsaved(self) -> str:
         reason = f"it stands at {self.progress.env_steps:,} env_steps, of which {self._saving.newest():,} are saved"
-        return f"run={self._config.run_dir}: {reason}; accepted is a directory that can be written"
+        return str(refuse("run", self._config.run_dir, "a directory that can be written", why=reason))
 
     def _how_it_ends(self, stop: str | None) -> str:
         if stop is None:

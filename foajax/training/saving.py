@@ -114,7 +114,7 @@ class Saving:
         return f"saved at {self.newest():,} env_steps; the same command goes on from here"
 
     def _open(self, run_dir: RunDir) -> Checkpoints:
-        return Checkpoints(run_dir.path / CHECKPOINTS, keep=self._config.train.keep, warn=self._warn)
+        return Checkpoints(run_dir.path / CHECKPOINTS, keep=self._config.train.keep_checkpoints, warn=self._warn)
 
     def _snapshot(self, progress: Progress) -> tuple[int, dict[str, Any], dict[str, Any]]:
         """A checkpoint's env_steps, arrays and the rest."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.envs.base import Environment
 from foajax.envs.make import make
 from foajax.runs.agents import Stored
@@ -33,14 +33,14 @@ def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = Fals
       ConfigError: a seed out of range; no such game, or one whose actions are no longer those of the training.
     """
     if not 0 <= seed < _SEEDS:
-        raise ConfigError(f"seed={seed}: accepted is an integer from 0 to {_SEEDS - 1}")
+        raise refuse("seed", seed, f"an integer from 0 to {_SEEDS - 1}")
     config, actions = stored.agent.config, stored.agent.num_actions
     # An engine adds an environment's number to its seed: neighbouring seeds may not lie side by side.
     first = int(np.random.SeedSequence([_WATCHED, seed]).generate_state(1)[0] >> 2)
     made = make(config, num_envs=num_envs, seed=first, render=render)
     if made.num_actions != actions:
         made.close()
-        raise ConfigError(f"game={config.game}: has {made.num_actions} actions; accepted are {actions}, as in training")
+        raise refuse("game", config.game, f"{actions}, as in training", why=f"has {made.num_actions} actions")
     return made
 
 

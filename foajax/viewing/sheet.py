@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.config.schema import RingSensor, Sensor
 from foajax.sensors.reconstruct import picture
 from foajax.sensors.sense import pixel_count, sense
@@ -165,4 +165,4 @@ def save(image: Image.Image, out: str) -> None:
     try:
         page.quantize(64, dither=Image.Dither.NONE).save(out, optimize=True)
     except OSError as error:
-        raise ConfigError(f"out={out}: accepted is a file that can be written ({error.strerror})") from None
+        raise refuse("out", out, f"a file that can be written ({error.strerror})") from None

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 from rich.progress import Progress
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.envs.make import steps_per_second
 from foajax.viewing.recording import Recording
 from foajax.viewing.scene import Scene
@@ -49,7 +49,7 @@ def _write_mp4(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
         for frame in itertools.chain([first], frames):
             process.stdin.write(frame.tobytes())
     if process.returncode:
-        raise ConfigError(f"out={file.parent}: accepted is a directory that a video can be written to")
+        raise refuse("out", file.parent, "a directory that a video can be written to")
 
 
 def _write_gif(frames: Iterator[Image.Image], file: Path, rate: float) -> None:

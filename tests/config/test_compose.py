@@ -16,7 +16,7 @@ import yaml
 
 from foajax import cli
 from foajax.config.compose import compose, list_experiments
-from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.parse import ConfigError
 from foajax.config.schema import Config, HeadConfig, LogPolarSensor, RingSensor
 from foajax.launch import sweep
 from foajax.launch.launch import run
@@ -64,33 +64,9 @@ def error(*overrides):
     return str(caught.value)
 
 
-def key_paths(mapping, prefix=""):
-    for name, value in mapping.items():
-        yield prefix + name
-        if isinstance(value, dict):
-            yield from key_paths(value, f"{prefix}{name}.")
-
-
-def test_base_yaml_states_every_key_and_the_dataclasses_defaults():
-    defaults = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
-    assert composed() == defaults
-    stated = yaml.safe_load((ROOT / "experiments/base.yaml").read_text())
-    known = to_mapping(defaults)
-    for other, mapping in (("defaults", stated), ("hydra", stated), ("sensor", known)):
-        del mapping[other]
-    assert set(key_paths(stated)) == set(key_paths(known))
-
-
-@pytest.mark.parametrize(
-    ("name", "sensor"), [("rings", RingSensor(rings=((1, 1, 1),))), ("logpolar", LogPolarSensor())]
-)
-def test_a_sensor_kind_states_every_key_and_the_dataclass_default(name, sensor):
-    stated = yaml.safe_load((ROOT / f"experiments/sensor/{name}.yaml").read_text())
-    known = to_mapping(sensor)
-    if name == "rings":
-        assert stated["rings"] == "???"  # has no default
-        stated["rings"] = known["rings"]
-    assert stated == known
+def test_without_a_word_every_key_has_its_default():
+    assert composed() == Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
+    assert composed("sensor=logpolar", "gaze.bounds=point").sensor == LogPolarSensor()
 
 
 def test_the_experiments_are_the_papers_their_packed_layouts_and_our_own():
@@ -139,22 +115,22 @@ def test_learner_paper_is_table_three():
     config = compose(["learner=paper"])
     learner, env = config.learner, config.env
     assert (learner.rollout_length, learner.learning_rate, env.num_envs) == (20, 1e-4, 32)
-    assert learner.natural == learner.vision == HeadConfig(gamma=0.99, gae_lambda=0.92, beta=0.01)
+    assert learner.natural == learner.vision == HeadConfig(gamma=0.99, gae_lambda=0.92, entropy_weight=0.01)
     assert (learner.adam_b1, learner.adam_b2, learner.adam_eps) == (0.9, 0.999, 1e-8)
     assert (learner.max_grad_norm, learner.clip_ratio, learner.reduction) == (None, None, "sum")
-    assert (learner.value_weight, learner.vision_weight, learner.epochs) == (1.0, 1.0, 1)
+    assert (learner.value_weight, learner.vision_weight, learner.num_epochs) == (1.0, 1.0, 1)
     assert learner.amsgrad and learner.value_target == "n_step"
-    assert learner.minibatches == 32
-    assert compose(["learner=paper", "env.num_envs=6"]).learner.minibatches == 6
+    assert learner.num_minibatches == 32
+    assert compose(["learner=paper", "env.num_envs=6"]).learner.num_minibatches == 6
     assert env.frame_shape == (80, 80) and env.frame_skip == 4 and env.noop_max == 30
     assert env.clip_rewards and env.episodic_life and env.fire_on_reset
 
 
 def test_learner_a2c_is_one_pass_without_clipping():
-    learner = compose(["learner=a2c", "learner.minibatches=4"]).learner
-    assert (learner.rollout_length, learner.minibatches, learner.epochs) == (20, 4, 1)
+    learner = compose(["learner=a2c", "learner.num_minibatches=4"]).learner
+    assert (learner.rollout_length, learner.num_minibatches, learner.num_epochs) == (20, 4, 1)
     assert learner.clip_ratio is None and not learner.normalize_advantages
-    assert learner.natural == learner.vision == HeadConfig(gae_lambda=0.92, beta=0.003)
+    assert learner.natural == learner.vision == HeadConfig(gae_lambda=0.92, entropy_weight=0.003)
 
 
 def test_network_choices():
@@ -198,15 +174,15 @@ def test_a_mapping_takes_new_keys_and_a_later_word_wins():
         ("gaze=null", ["gaze=null: accepted is one of frozen, learned, none, random, scripted"]),
         ("gaze=[frozen]", ["gaze=[frozen]: accepted is one of"]),
         ("gaze={mode: frozen}", ["gaze={mode: frozen}: accepted is one of"]),
-        ("learner.gama=0.9", ["learner.gama=0.9: unknown key; accepted are rollout_length, "]),
-        ("gama=0.9", ["gama=0.9: unknown key; accepted are name, "]),
+        ("learner.gama=0.9", ["learner.gama=0.9: unknown key; accepted is one of rollout_length, "]),
+        ("gama=0.9", ["gama=0.9: unknown key; accepted is one of name, "]),
         ("foo/bar=1", ["foo/bar=1: unknown key"]),
-        ("game.speed=2", ["game={'speed': 2}: accepted is a string"]),
+        ("game.speed=2", ["game={'speed': 2}: accepted is a name"]),
         ("learner.natural=3", ["learner.", "natural", "accepted is"]),
         ("seed=one", ["seed=one: accepted is an integer"]),
         ("seed=1.5", ["seed=1.5: accepted is an integer"]),
         ("learner.natural.gamma=1.5", ["learner.natural.gamma=1.5: accepted is a number in [0, 1]"]),
-        ("env.frame_shape=80", ["env.frame_shape=80: accepted is [an integer, an integer]"]),
+        ("env.frame_shape=80", ["env.frame_shape=80: accepted is [height, width], each from 8 to 10000"]),
         ("sensor.rings.first=3", ["sensor.rings.first=3", "accepted is"]),
         ("sensor.rings.9=3", ["sensor.rings.9=3", "accepted is"]),
         ("experiment", ["experiment: accepted is key=value"]),
@@ -219,7 +195,7 @@ def test_a_mapping_takes_new_keys_and_a_later_word_wins():
         ("sensor@eye=constant70", ["sensor@eye=constant70: accepted is key=value"]),
         ("game=pong,breakout", ["game=pong,breakout: accepted is one value", "--multirun"]),
         ("seed=range(3)", ["seed=range(3): accepted is one value", "--multirun"]),
-        ("hydra.run.dir=x", ["hydra.run.dir=x: accepted only together with --multirun"]),
+        ("hydra.run.dir=x", ["hydra.run.dir=x: accepted is the same with --multirun"]),
         ("game=${nothing}", ["game: ", "'nothing'", "accepted is"]),
         ("game=${oc.env:FOAJAX_NOT_SET}", ["game: ", "'FOAJAX_NOT_SET'", "accepted is"]),
         ("game=${what:1}", ["game: ", "what", "accepted is"]),
@@ -376,7 +352,7 @@ def test_runs_of_a_sweep_may_not_share_a_directory(cwd, runs, capsys):
 
 def test_without_a_launcher_each_run_is_a_command_of_its_own(cwd, runs, monkeypatch):
     started = []
-    monkeypatch.setattr(sweep, "run_all", lambda runs, *, jobs: started.append((runs, jobs)) or 0)
+    monkeypatch.setattr(sweep, "run_all", lambda runs, *, jobs, command: started.append((runs, jobs)) or 0)
     assert run(runs.record, ["-m", "gaze=frozen,random", "seed=3"]) == 0
     assert run(runs.record, ["--multirun", "--jobs=4", "seed=0,1"]) == 0
     (first, one), (_, four) = started
@@ -391,8 +367,8 @@ def test_without_a_launcher_each_run_is_a_command_of_its_own(cwd, runs, monkeypa
     [
         (["-m", "--jobs=0"], "--jobs=0: accepted is --jobs=N"),
         (["-m", "--jobs", "4"], "--jobs: accepted is --jobs=N"),
-        (["--jobs=2"], "--jobs=2: accepted only together with --multirun"),
-        ([*HERE, "--jobs=2"], "--jobs=2: accepted only together with --multirun"),
+        (["--jobs=2"], "--jobs=2: accepted is the same with --multirun"),
+        ([*HERE, "--jobs=2"], "--jobs=2: accepted is the same with --multirun"),
     ],
 )
 def test_jobs_is_a_number_and_for_local_sweeps(cwd, runs, capsys, arguments, said):
@@ -420,7 +396,65 @@ def test_composing_works_inside_another_application_of_hydra(tmp_path):
 def test_a_learner_and_a_network_can_be_chosen_for_seek():
     config = composed("experiment=seek", "learner=paper", "network=a3c")
     assert config.learner == composed("learner=paper").learner and config.network == composed("network=a3c").network
-    assert composed("experiment=seek").learner.epochs == 4 and composed("experiment=seek").network.lstm == 64
+    assert composed("experiment=seek").learner.num_epochs == 4 and composed("experiment=seek").network.lstm == 64
+
+
+@pytest.fixture
+def own(tmp_path_factory):
+    """A directory with choices of one's own, one of them with words of before."""
+    files = {
+        "experiment/mine": "# @package _global_\ndefaults:\n  - override /sensor: decreasing_packed\nname: mine\n"
+        "train: {keep: 9}\nlearner: {epochs: 7, natural: {beta: 0.5}}\n",
+        "sensor/small": "defaults: [rings]\nrings: [[8, 8, 1]]\n",
+        "gaze/fast": "step: 16\n",
+    }
+    directory = tmp_path_factory.mktemp("it's, own")
+    for name, text in files.items():
+        (directory / f"{name}.yaml").parent.mkdir()
+        (directory / f"{name}.yaml").write_text(text)
+    return directory
+
+
+def test_choices_of_ones_own_stand_beside_ours(own):
+    config = compose(["experiment=mine", "gaze=fast"], own)
+    assert (config.name, config.sensor) == ("mine", composed("experiment=decreasing_packed").sensor)
+    assert config.gaze.step == 16 and compose(["sensor=small"], own).sensor.window == (8, 8)
+    with pytest.raises(ConfigError, match="experiment=mien: accepted is one of .*mine.*did you mean mine"):
+        compose(["experiment=mien"], own)
+    with pytest.raises(ConfigError, match="experiment=mine: accepted is one of"):
+        compose(["experiment=mine"])
+
+
+def test_words_of_before_in_a_file_give_way_to_the_command_lines(own):
+    config = compose(["experiment=mine", "train.keep_checkpoints=2"], own)
+    assert (config.train.keep_checkpoints, config.learner.num_epochs) == (2, 7)
+    assert config.learner.natural.entropy_weight == config.learner.vision.entropy_weight == 0.5
+
+
+def test_a_run_of_ones_own_is_started_swept_and_shown(cwd, own, runs, capsys, monkeypatch):
+    words = [f"--config-dir={own}", "experiment=mine"]
+    assert run(runs.record, ["--config-dir", str(own), "experiment=mine"]) == run(runs.record, words) == 0
+    assert run(runs.record, [*words, *HERE, "sensor=small,constant70"]) == 0
+    assert [config.name for config in runs] == ["mine", "mine", "mine-sensor=small", "mine-sensor=constant70"]
+    capsys.readouterr()
+    assert run(runs.record, [*words, "--cfg", "job"]) == 0 and "name: mine" in capsys.readouterr().out
+    assert run(runs.record, [words[0], "--help"]) == 0 and "gaze: fast, frozen" in capsys.readouterr().out
+    monkeypatch.setattr(sweep, "run_all", lambda runs, *, jobs, command: int(command[-1] != words[0]))
+    assert run(runs.record, [*words, "-m", "seed=1,2"]) == 0
+    assert run(runs.record, ["--config-dir=nowhere"]) == 2
+    assert "--config-dir=nowhere: accepted is a directory with experiment/" in capsys.readouterr().err
+
+
+def test_words_of_before_are_understood_and_answered_with_todays(cwd, runs, capsys):
+    assert run(runs.record, ["learner.epochs=3", "train.keep=${learner.epochs}"]) == 0
+    assert (runs[0].learner.num_epochs, runs[0].train.keep_checkpoints) == (3, 3)
+    said = "foajax: learner.epochs is now learner.num_epochs\nfoajax: train.keep is now train.keep_checkpoints\n"
+    assert capsys.readouterr().err == said
+    for launcher in (["-m"], HERE):
+        assert run(runs.record, [*launcher, "learner.epochs=0,1"]) == 2
+        assert capsys.readouterr().err.endswith("learner.num_epochs=0: accepted is an integer from 1 to 1000\n")
+    assert run(runs.record, [*HERE, "learner.epochs=3,4"]) == 0
+    assert [config.name for config in runs[1:]] == ["constant70-learner.epochs=3", "constant70-learner.epochs=4"]
 
 
 def test_composing_works_from_any_directory(cwd):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foajax.config.parse import ConfigError, to_mapping
+from foajax.config.parse import ConfigError, replace, to_mapping
 from foajax.config.schema import Config, GazeConfig, LogPolarSensor, RingSensor, from_mapping
 
 RINGS = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
@@ -109,7 +108,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones(config, section, name):
     if path in set(paths(to_mapping(config))):
         return
     message = error(changed(config, path, 1))
-    assert message.startswith(f"{'.'.join(path)}=1: unknown key; accepted are ")
+    assert message.startswith(f"{'.'.join(path)}=1: unknown key; accepted is one of ")
 
 
 @pytest.mark.parametrize("name", ["name", "sensor"])
@@ -153,8 +152,8 @@ OUT_OF_RANGE = [
     ("gaze.path", [[0, -1]]),
     ("env.engine", "gym"),
     ("env.num_envs", 0),
-    ("env.groups", 0),
-    ("env.groups", 3),
+    ("env.num_groups", 0),
+    ("env.num_groups", 3),
     ("env.frame_shape", [7, 80]),
     ("env.crop_top", {}),
     ("env.crop_top", {"default": 51}),
@@ -173,9 +172,9 @@ OUT_OF_RANGE = [
     ("network.lstm", 10**9),
     ("network.normalization", "batch"),
     ("learner.rollout_length", 1),
-    ("learner.minibatches", 0),
-    ("learner.minibatches", 5),
-    ("learner.epochs", 0),
+    ("learner.num_minibatches", 0),
+    ("learner.num_minibatches", 5),
+    ("learner.num_epochs", 0),
     ("learner.clip_ratio", 0.0),
     ("learner.learning_rate", 0.0),
     ("learner.learning_rate", float("nan")),
@@ -194,13 +193,13 @@ OUT_OF_RANGE = [
     ("learner.natural.gamma", 1.01),
     ("learner.natural.gae_lambda", -0.01),
     ("learner.vision.gamma", -1),
-    ("learner.vision.beta", -0.5),
+    ("learner.vision.entropy_weight", -0.5),
     ("train.env_steps", 0),
     ("train.env_steps", 10**15),
     ("train.dump_skipped", 1),
     ("train.log_every", 0.0),
     ("train.checkpoint_every", -1.0),
-    ("train.keep", 0),
+    ("train.keep_checkpoints", 0),
     ("train.max_skipped", 0),
 ]
 
@@ -232,7 +231,7 @@ def test_a_log_polar_value_out_of_range_is_refused_by_name(key, value):
         ("env.sticky_actions", 0),
         ("env.noop_max", 0),
         ("network.dense", 0),
-        ("learner.minibatches", 32),
+        ("learner.num_minibatches", 32),
         ("train.env_steps", 2048 * (2**31 // 64 - 2)),  # rollouts of 64 steps, counted in 32 bits
         ("learner.clip_ratio", 0.2),
         ("learner.max_grad_norm", None),
@@ -264,7 +263,7 @@ def test_to_mapping_is_plain_and_the_inverse_of_from_mapping(config):
 
 
 def test_a_config_cannot_be_changed():
-    with pytest.raises(dataclasses.FrozenInstanceError):
+    with pytest.raises(AttributeError):
         RINGS.seed = 1
 
 
@@ -277,4 +276,4 @@ def test_a_config_cannot_be_changed():
     ],
 )
 def test_the_run_directory_is_named_after_the_run(game, run, expected):
-    assert dataclasses.replace(RINGS, game=game, run=run, seed=3).run_dir == expected
+    assert replace(RINGS, game=game, run=run, seed=3).run_dir == expected

@@ -61,7 +61,7 @@ def test_a_missing_value_is_one_line(key):
 @pytest.mark.parametrize("section", SECTIONS, ids=".".join)
 def test_an_unknown_name_is_one_line(section):
     key = ".".join([*section, "no_such_key"])
-    assert_refused([f"{key}=17"], f"{key}=17: unknown key; accepted are ")
+    assert_refused([f"{key}=17"], f"{key}=17: unknown key; accepted is one of ")
 
 
 def as_word(value):

@@ -33,7 +33,7 @@ WORDS = [
     "network.dense=16",
     "network.lstm=16",
     "env.num_envs=32",
-    "learner.minibatches=4",
+    "learner.num_minibatches=4",
     "learner.rollout_length=4",
     "train.log_every=1e-6",
 ]

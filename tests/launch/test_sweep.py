@@ -173,7 +173,7 @@ TINY = [
     "network.dense=16",
     "network.lstm=16",
     "env.num_envs=8",
-    "learner.minibatches=2",
+    "learner.num_minibatches=2",
     "learner.rollout_length=5",
 ]
 

@@ -45,7 +45,7 @@ def test_the_loss_is_the_sum_of_its_weighted_terms(seek):
         weight
         * (
             metrics[f"{head}_policy_loss"]
-            - getattr(config, head).beta * metrics[f"{head}_entropy"]
+            - getattr(config, head).entropy_weight * metrics[f"{head}_entropy"]
             + config.value_weight * metrics[f"{head}_value_loss"]
         )
         for head, weight in (("natural", 1.0), ("vision", config.vision_weight))
@@ -155,7 +155,7 @@ def test_a_clipped_update_is_counted(seek, scale, clipped):
 
 
 def test_frames_are_counted_once_however_many_passes():
-    one, two = (Loop("game=seek", *VIEW, f"learner.epochs={passes}") for passes in (1, 2))
+    one, two = (Loop("game=seek", *VIEW, f"learner.num_epochs={passes}") for passes in (1, 2))
     one.run(1), two.run(1)
     np.testing.assert_allclose(one.state.statistics.weight, two.state.statistics.weight, rtol=1e-6)
     assert two.state.updates == 2 * one.state.updates
@@ -196,7 +196,7 @@ def test_information_is_what_decisions_tell_of_what_was_seen(seek):
 
 def test_two_groups_see_what_each_would_alone():
     """Groups only interleave: the first of two acts as it would by itself."""
-    loop = Loop("game=seek", *VIEW, "env.groups=2")
+    loop = Loop("game=seek", *VIEW, "env.num_groups=2")
     alone = Collector(loop.agent, loop.programs, make_environments(loop.config, 0)[:1], seed=0)
     (expected,), _ = alone.collect(loop.state, 0)
     (first, second), _ = loop.collect()
@@ -229,7 +229,7 @@ def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
 
 
 def test_the_schedule_counts_the_updates_of_a_rollout_that_has_begun():
-    config = compose.compose([*SMALL, "learner.epochs=3", "train.env_steps=49"])  # rollouts of 48
+    config = compose.compose([*SMALL, "learner.num_epochs=3", "train.env_steps=49"])  # rollouts of 48
     assert total_updates(Agent(config, 4, 34)) == 2 * 2 * 3
 
 

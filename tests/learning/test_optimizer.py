@@ -1,7 +1,5 @@
 """Adam and AMSGrad against PyTorch's rule in NumPy (and PyTorch itself where it is installed)."""
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import numpy as np
 import optax
 import pytest
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, replace
 from foajax.config.schema import LearnerConfig
 from foajax.learning.optimizer import make_optimizer
 
@@ -67,7 +65,7 @@ def run(learner, total_updates, compiled=jax.jit):
 @pytest.mark.parametrize("max_grad_norm", [None, 0.05])
 @pytest.mark.parametrize("schedule", ["constant", "linear"])
 def test_every_update_is_pytorchs(amsgrad, eps, max_grad_norm, schedule):
-    learner = dataclasses.replace(PLAIN, amsgrad=amsgrad, adam_eps=eps, max_grad_norm=max_grad_norm, schedule=schedule)
+    learner = replace(PLAIN, amsgrad=amsgrad, adam_eps=eps, max_grad_norm=max_grad_norm, schedule=schedule)
     actual, expected = list(run(learner, 150)), list(pytorch_rule(learner, 150))
     assert len(actual) == UPDATES
     np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * learner.learning_rate)
@@ -77,13 +75,13 @@ def test_every_update_is_pytorchs(amsgrad, eps, max_grad_norm, schedule):
 @pytest.mark.parametrize(("most", "share"), [(2, 2 / 5), (5, 1.0), (64, 1.0)])
 def test_weights_with_many_inputs_move_in_inverse_proportion(most, share):
     whole = np.array(list(run(PLAIN, UPDATES)))
-    scaled = np.array(list(run(dataclasses.replace(PLAIN, full_rate_inputs=most), UPDATES)))
+    scaled = np.array(list(run(replace(PLAIN, full_rate_inputs=most), UPDATES)))
     expected = whole * np.repeat([1.0, share, 1.0], [3, 15, 1])  # bias, kernel, scale
     np.testing.assert_allclose(scaled, expected, rtol=1e-6)
 
 
 def test_other_decay_rates_and_no_jit():
-    learner = dataclasses.replace(PLAIN, adam_b1=0.0, adam_b2=0.9, adam_eps=1e-3, max_grad_norm=0.05)
+    learner = replace(PLAIN, adam_b1=0.0, adam_b2=0.9, adam_eps=1e-3, max_grad_norm=0.05)
     actual = list(run(learner, 150, compiled=lambda f: f))
     expected = list(pytorch_rule(learner, 150))
     np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * learner.learning_rate)
@@ -96,7 +94,7 @@ def test_against_pytorch(amsgrad, eps):
     param = torch.nn.Parameter(torch.zeros(19))
     optimizer = torch.optim.Adam([param], lr=PLAIN.learning_rate, eps=eps, amsgrad=amsgrad)
     total = np.zeros(19)
-    learner = dataclasses.replace(PLAIN, adam_eps=eps, amsgrad=amsgrad)
+    learner = replace(PLAIN, adam_eps=eps, amsgrad=amsgrad)
     for update, grads in zip(run(learner, 1), gradients(), strict=True):
         param.grad = torch.tensor(np.concatenate([np.ravel(g) for g in jax.tree.leaves(grads)]))
         optimizer.step()
@@ -114,7 +112,7 @@ def one_update(learner, grads):
 
 def test_first_update_by_hand():
     """After bias correction the moments are g and g^2: -lr g / (|g| + eps)."""
-    learner = dataclasses.replace(PLAIN, learning_rate=0.5, adam_eps=1.0)
+    learner = replace(PLAIN, learning_rate=0.5, adam_eps=1.0)
     updates, state = one_update(learner, {"w": jnp.array([3.0, -1.0, 0.0])})
     np.testing.assert_allclose(updates["w"], [-0.375, 0.25, 0.0], rtol=1e-6)
     np.testing.assert_allclose(state.mu["w"], [0.3, -0.1, 0.0], rtol=1e-6)
@@ -124,19 +122,19 @@ def test_first_update_by_hand():
 @pytest.mark.parametrize("max_grad_norm, expected", [(1.0, [0.06, 0.08]), (5.0, [0.3, 0.4]), (6.0, [0.3, 0.4])])
 def test_clipping_by_hand(max_grad_norm, expected):
     """The gradient (3, 4) has norm 5, over both leaves; `mu` is a tenth of what is left of it."""
-    learner = dataclasses.replace(PLAIN, max_grad_norm=max_grad_norm)
+    learner = replace(PLAIN, max_grad_norm=max_grad_norm)
     _, state = one_update(learner, {"a": jnp.array(3.0), "b": jnp.array([4.0])})
     np.testing.assert_allclose([state.mu["a"], state.mu["b"][0]], expected, rtol=1e-6)
 
 
 def test_zero_gradients_give_zero_updates():
-    updates, _ = one_update(dataclasses.replace(PLAIN, max_grad_norm=0.5), {"w": jnp.zeros(3)})
+    updates, _ = one_update(replace(PLAIN, max_grad_norm=0.5), {"w": jnp.zeros(3)})
     np.testing.assert_array_equal(updates["w"], 0.0)
 
 
 def test_maximum_outlives_a_large_gradient():
     """This is what tells AMSGrad from Adam: afterwards the steps stay small."""
-    learner = dataclasses.replace(PLAIN, adam_b1=0.0, adam_b2=0.5)
+    learner = replace(PLAIN, adam_b1=0.0, adam_b2=0.5)
     optimizer = make_optimizer(learner, 10)
     state = optimizer.init(jnp.zeros(1))
     _, state = optimizer.update(jnp.array([100.0]), state)
@@ -151,7 +149,7 @@ def test_maximum_outlives_a_large_gradient():
 
 def rates(total_updates, **learner):
     """The learning rates of six updates: without averages and eps an update is its rate."""
-    learner = dataclasses.replace(PLAIN, adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30, **learner)
+    learner = replace(PLAIN, adam_b1=0.0, adam_b2=0.0, adam_eps=1e-30, **learner)
     optimizer = make_optimizer(learner, total_updates)
     state = optimizer.init(jnp.zeros(1))
     sizes = []
@@ -176,7 +174,7 @@ def test_warmup_rises_to_the_rate_and_joins_the_schedule():
 
 
 def test_state_survives_being_stored_and_fits_every_configuration():
-    clipped = dataclasses.replace(PLAIN, max_grad_norm=0.5, schedule="linear")
+    clipped = replace(PLAIN, max_grad_norm=0.5, schedule="linear")
     grads = {"w": jnp.array([1.0, -2.0]), "b": jnp.array(3.0)}
     _, state = one_update(PLAIN, grads)
     leaves, tree = jax.tree.flatten(state)
@@ -209,7 +207,7 @@ def test_no_updates_are_refused(total_updates):
 @pytest.mark.parametrize("max_grad_norm", [None, 0.5])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1.0])
 def test_a_gradient_that_is_not_accepted_changes_nothing(max_grad_norm, value):
-    optimizer = make_optimizer(dataclasses.replace(PLAIN, max_grad_norm=max_grad_norm), 10)
+    optimizer = make_optimizer(replace(PLAIN, max_grad_norm=max_grad_norm), 10)
     params = {"a": jnp.array([1.0, -2.0]), "b": jnp.array(3.0)}
     for state in (optimizer.init(params), optimizer.update(params, optimizer.init(params))[1]):
         bad = jax.tree.map(lambda p: jnp.full_like(p, value), params)

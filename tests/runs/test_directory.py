@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import platform
+import re
 import shutil
 import signal
 import subprocess
@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from foajax.config.parse import ConfigError, to_mapping
-from foajax.config.schema import Config, LogPolarSensor, RingSensor, from_mapping
+from foajax.config.parse import ConfigError, flatten, replace, to_mapping
+from foajax.config.schema import RENAMED, Config, LogPolarSensor, RingSensor, from_mapping, renamed
 from foajax.runs import provenance
 from foajax.runs.directory import load_config, open_run
 from foajax.runs.lock import RunError
@@ -78,7 +78,7 @@ def test_every_start_is_added(config):
 
 
 def test_config_survives_the_file_in_every_detail(config, tmp_path):
-    log_polar = dataclasses.replace(
+    log_polar = replace(
         changed(config, learner__adam_eps=3e-17, gaze__start=[40, 41], gaze__bounds="point"),
         sensor=LogPolarSensor(),
         game="gymnasium:ALE/Pong-v5",
@@ -116,6 +116,26 @@ def test_a_run_from_before_a_key_is_read_as_it_was_made(config, group, key, befo
     assert getattr(getattr(load_config(config.run_dir), group), key) == mapping[group].pop(key) != before
     file.write_text(yaml.safe_dump(mapping))
     assert getattr(getattr(load_config(config.run_dir), group), key) == before
+
+
+def test_a_run_with_words_of_before_is_read(config):
+    values = {"num_epochs": 3, "num_minibatches": 8, "natural": {"entropy_weight": 0.02}}
+    other = changed(config, train__keep_checkpoints=5, **{f"learner__{key}": value for key, value in values.items()})
+    begun(other)
+    file = Path(config.run_dir) / "config.yaml"
+    text = file.read_text()
+    for old, new in RENAMED.items():
+        text = re.sub(rf"\b{new.rpartition('.')[2]}:", f"{old.rpartition('.')[2]}:", text)
+    assert "  keep: 5\n" in text and "  beta: 0.02\n" in text
+    file.write_text(text)
+    assert load_config(config.run_dir) == other
+    open_run(other, command=COMMAND).close()  # and goes on
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("agents/*/config.yaml")), ids=lambda path: path.parent.name)
+def test_a_shipped_agent_is_read_with_all_that_its_file_says(path):
+    said = dict(flatten(renamed(yaml.safe_load(path.read_text())))) | {"run": str(path.parent)}
+    assert said.items() <= dict(flatten(to_mapping(load_config(path.parent)))).items()
 
 
 def test_load_config_follows_a_moved_run(config, tmp_path):
@@ -169,7 +189,7 @@ def test_what_was_refused_before_it_began_may_be_corrected(config):
     ("key", "value", "line"),
     [
         ("learner__learning_rate", 0.002, "learner.learning_rate=0.002: the run in {run} has 0.001; "),
-        ("learner__vision__beta", 0.5, "learner.vision.beta=0.5: the run in {run} has 0.003; "),
+        ("learner__vision__entropy_weight", 0.5, "learner.vision.entropy_weight=0.5: the run in {run} has 0.003; "),
         ("learner__clip_ratio", 0.2, "learner.clip_ratio=0.2: the run in {run} has 0.1; "),
         ("game", "pong", "game=pong: the run in {run} has breakout; "),
         ("seed", 3, "seed=3: the run in {run} has 0; "),
@@ -195,14 +215,14 @@ def test_what_means_the_same_is_taken_over(config):
         train__env_steps=7,
         train__log_every=1.5,
         train__checkpoint_every=2.5,
-        train__keep=9,
+        train__keep_checkpoints=9,
         train__max_skipped=3,
         env__threads=2,
         profile=True,
         run=os.path.relpath(config.run_dir),
     )
     open_run(other, command=COMMAND).close()
-    assert load_config(config.run_dir) == dataclasses.replace(other, run=config.run_dir)
+    assert load_config(config.run_dir) == replace(other, run=config.run_dir)
 
 
 def test_the_length_of_a_run_counts_where_the_learning_rate_follows_it(config):

@@ -88,7 +88,7 @@ def test_the_best_so_far_is_kept_over_starts(run):
     (best / "meta.json").write_text(json.dumps(meta))
     durable.seal(best)
     before = rows(run)[-1]
-    code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=16000", "train.keep=1")
+    code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=16000", "train.keep_checkpoints=1")
     assert code == 0, err
     after = rows(run)[-1]
     assert after["games"] > before["games"] and after["best_score"] >= before["best_score"]

@@ -343,5 +343,5 @@ def test_ring_boxes_frame_what_is_shown():
 
 def test_a_grid_finer_than_the_frame_is_refused():
     sensor = RingSensor(((4, 4, 1),), peripheral=(5, 9))
-    with pytest.raises(ConfigError, match=r"sensor\.peripheral=\(5, 9\): accepted is a grid no finer .* 8x8"):
+    with pytest.raises(ConfigError, match=r"sensor\.peripheral=\[5, 9\]: accepted is a grid no finer .* 8x8"):
         sense(jnp.zeros((8, 8)), jnp.array([4, 4]), sensor=sensor)
