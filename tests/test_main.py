@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 import foajax
 from foajax.__main__ import COMMANDS, main
+from foajax.config.table import groups
 
 PACKAGE = Path(foajax.__file__).parent
 
@@ -23,6 +25,12 @@ def test_a_public_name_is_found_on_first_use(name):
 def test_a_name_that_is_not_there_is_an_attribute_error():
     with pytest.raises(AttributeError, match="foajax.*nothing"):
         foajax.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS.keys() - {"train"}))
+def test_every_option_of_a_command_has_a_sentence(name):
+    options = importlib.import_module(f"foajax.{name}").Options
+    assert all(key.sentence[0].isupper() and key.sentence[-1] == "." for group in groups(options) for key in group.keys)
 
 
 def test_every_command_is_listed_with_a_sentence(monkeypatch, capsys):

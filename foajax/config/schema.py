@@ -269,7 +269,7 @@ class DistributedConfig(Section):
 class Config(Section):
     """One run."""
 
-    name: Name = Field(description="Name of the experiment, e.g. constant70.")
+    name: Name = Field(description="Name of the experiment, such as constant70.")
     sensor: Annotated[
         Annotated[RingSensor, Tag("rings")] | Annotated[LogPolarSensor, Tag("logpolar")], Discriminator(_kind)
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import pickle
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from foajax.config.parse import ConfigError, replace, to_mapping
 from foajax.config.schema import Config, GazeConfig, LogPolarSensor, RingSensor, from_mapping
+from foajax.config.table import groups
 
 RINGS = Config(name="constant70", sensor=RingSensor(rings=((70, 70, 2),)))
 LOG_POLAR = Config(name="logpolar", sensor=LogPolarSensor(), gaze=GazeConfig(bounds="point"))
@@ -265,6 +267,38 @@ def test_to_mapping_is_plain_and_the_inverse_of_from_mapping(config):
 def test_a_config_cannot_be_changed():
     with pytest.raises(AttributeError):
         RINGS.seed = 1
+
+
+@pytest.mark.parametrize("config", [RINGS, LOG_POLAR], ids=lambda config: config.name)
+def test_a_config_is_a_key_of_a_mapping_wherever_it_comes_from(config):
+    for same in (pickle.loads(pickle.dumps(config)), copy.deepcopy(config), from_mapping(to_mapping(config))):
+        assert {config: 1}[same] == 1
+    with pytest.raises(TypeError):
+        config.env.crop_top["pong"] = 30
+
+
+def test_a_section_with_other_values_is_checked_again():
+    assert replace(RINGS.gaze, step=8) == GazeConfig(step=8)
+    with pytest.raises(ConfigError, match="^gaze.step=0: accepted is an integer from 1 to 10000$"):
+        replace(RINGS.gaze, step=0)
+    with pytest.raises(ConfigError, match="^seed=-1: accepted is "):
+        replace(RINGS, seed=-1)
+
+
+def test_a_section_takes_its_first_keys_by_place():
+    assert RingSensor([[8, 8, 1]]) == RingSensor(rings=((8, 8, 1),))
+    with pytest.raises(TypeError):
+        GazeConfig("learned", 5, 4, "point", "centre", (), 7)
+
+
+@pytest.mark.parametrize("near, word", [("learner.num_epoch", "num_epochs"), ("sed", "seed"), ("gaze.moode", "mode")])
+def test_the_nearest_key_is_suggested(near, word):
+    assert error(changed(RINGS, near.split("."), 1)).endswith(f" (did you mean {word}?)")
+
+
+@pytest.mark.parametrize("key", [key for group in groups(Config) for key in group.keys], ids=lambda key: key.name)
+def test_every_key_has_a_sentence(key):
+    assert key.sentence[0].isupper() and key.sentence.endswith(".") and key.sentence.count(". ") == 0
 
 
 @pytest.mark.parametrize(
