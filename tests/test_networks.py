@@ -9,7 +9,8 @@ import pytest
 from foajax.config import compose
 from foajax.config.schema import NetworkConfig
 from foajax.learning.agent import Agent
-from foajax.networks.network import initial_core_state, make_torso
+from foajax.networks.network import initial_core_state
+from foajax.networks.torsos import make_torso
 from foajax.sensors.sense import image_shapes
 
 EXPERIMENTS = compose.list_experiments()

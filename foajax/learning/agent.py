@@ -42,11 +42,15 @@ class Agent:
         """The network, without its parameters."""
         return networks.make_network(self.config, self.num_actions)
 
+    @property
+    def image_shapes(self) -> tuple[tuple[int, int, int], ...]:
+        """Of what the sensor gives of a frame, (h, w, 1) each."""
+        return image_shapes(self.config.sensor, self.config.env.frame_shape)
+
     def initial_params(self, key: PRNGKeyArray) -> Params:
         """Parameters before any learning."""
         side = self.side(jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2), jnp.int32), jnp.zeros(1), jnp.zeros(1, bool))
-        shapes = image_shapes(self.config.sensor, self.config.env.frame_shape)
-        return networks.initial_params(self.network, key, shapes, side.shape[-1])
+        return networks.initial_params(self.network, key, self.image_shapes, side.shape[-1])
 
     def initial_statistics(self) -> FrameStatistics:
         """Frame statistics before any frame."""

@@ -1,8 +1,7 @@
-"""The recurrent network with two heads: torso, LSTM, four outputs. The only file that imports flax."""
+"""The recurrent network with two heads: torso, LSTM, four outputs."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,77 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from foajax.config.schema import Config, NetworkConfig
-from foajax.networks.convolution import convolve, max_pool
 from foajax.networks.lstm import lstm
+from foajax.networks.torsos import RELU_GAIN, make_torso
 from foajax.types import CoreState, NetworkOutput, Params
-
-_RELU_GAIN = math.sqrt(2.0)  # keeps the variance through a ReLU (He et al. 2015)
-
-
-class Convolution(nn.Module):
-    """One convolution with a bias; the form is chosen by the backend."""
-
-    features: int
-    kernel: tuple[int, int]
-    stride: int = 1
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N h w D"]:
-        shape = (*self.kernel, x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.orthogonal(_RELU_GAIN), shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        return convolve(x, kernel, stride=self.stride) + bias.reshape(1, 1, 1, -1)
-
-
-class NatureTorso(nn.Module):
-    """Convolutions of Mnih et al. (2015): 32 8x8/4, 64 4x4/2, 64 3x3/1.
-
-    A packed image is already subsampled, so below 44 pixels the first layer halves its kernel and stride: a
-    unit then sees about the same patch of the frame as on the canvas. Layers that no longer fit are left out.
-    The strides fit the 84 pixels of that paper and leave out the last 4 rows and columns of 80, where Breakout has
-    its paddle. With `covers` nothing is left out: the first kernel grows by what its stride leaves, which costs little
-    there, and the maps of the others are padded with zeros.
-    """
-
-    covers: bool = True
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
-        first = (8, 4) if min(x.shape[1:3]) >= 44 else (4, 2)
-        for layer, (features, (kernel, stride)) in enumerate(((32, first), (64, (4, 2)), (64, (3, 1)))):
-            if min(x.shape[1:3]) < kernel:
-                continue
-            height = width = kernel
-            if self.covers and layer == 0:
-                height, width = (kernel + (size - kernel) % stride for size in x.shape[1:3])
-            elif self.covers:
-                bottom, right = (-(size - kernel) % stride for size in x.shape[1:3])
-                x = jnp.pad(x, ((0, 0), (0, bottom), (0, right), (0, 0)))
-            x = nn.relu(Convolution(features, (height, width), stride)(x))
-        return x.reshape(x.shape[0], -1)
-
-
-class A3CTorso(nn.Module):
-    """Four times 'convolution, 2x2 max-pool, ReLU': 32 5x5, 32 5x5, 64 4x4, 64 3x3, as public A3C code does.
-
-    Maps of 4x4 and less are not pooled further, which on an 80x80 canvas changes nothing.
-    """
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
-        for features, kernel, border in ((32, 5, 2), (32, 5, 1), (64, 4, 1), (64, 3, 1)):
-            x = jnp.pad(x, ((0, 0), (border, border), (border, border), (0, 0)))
-            x = Convolution(features, (kernel, kernel))(x)
-            x = nn.relu(max_pool(x) if min(x.shape[1:3]) > 4 else x)
-        return x.reshape(x.shape[0], -1)
-
-
-def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
-    """The torso of one image."""
-    if config.torso == "a3c":
-        return A3CTorso(name=name)
-    return NatureTorso(covers=config.padding == "cover", name=name)
-
 
 _SMALLEST_IMAGE = 8  # below it (a 5x5 periphery) the values go straight to the next layer
 
@@ -145,7 +76,7 @@ class Network(nn.Module):
         if self.config.dense_norm:
             features = nn.LayerNorm(use_bias=False, use_scale=False, name="dense_norm")(features)
         if self.config.dense:
-            dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(_RELU_GAIN), name="dense")
+            dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(RELU_GAIN), name="dense")
             features = nn.relu(dense(features))
         return features
 

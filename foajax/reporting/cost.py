@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from foajax.config.compose import compose
 from foajax.config.schema import Config
 from foajax.learning.agent import Agent
-from foajax.networks.network import make_torso
+from foajax.networks.torsos import make_torso
 from foajax.sensors.sense import pixel_count
 from foajax.types import CoreState, Params
 
