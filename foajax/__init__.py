@@ -34,7 +34,7 @@ else:
         "RingSensor": "config.schema",
         "FoveatedObservation": "sensors.wrappers",
         "FoveatedVectorObservation": "sensors.wrappers",
-        "load_agent": "store",
+        "load_agent": "runs.agents",
         "sense": "sensors.sense",
     }
 

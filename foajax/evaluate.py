@@ -34,13 +34,14 @@ _PROTOCOL = (
 class Options:
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
+    run: str  # a directory of a run or an agent, or the name of a shipped agent
     episodes: int = 100
     policy: Literal["sampled", "greedy"] = "sampled"  # greedy games that begin alike are alike: 31 ways with no-ops
     checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     json: str | None = None  # file for the result
     num_envs: int = 25  # games played at once
     seed: int = 0
+    trust: bool = False  # whether code that the agent's configuration names may run
 
     def __post_init__(self) -> None:
         for key in ("episodes", "num_envs"):
@@ -53,13 +54,13 @@ def evaluate(arguments: Sequence[str]) -> None:
     """The command."""
     protocol = [word for word in arguments if word.startswith("env.")]
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
-    stored = load_agent(options.run, best=options.checkpoint == "best")
+    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
     env = cli.override(stored.agent.config.env, protocol, "env", _PROTOCOL)
     config = dataclasses.replace(stored.agent.config, env=env)
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("games", total=options.episodes)
         games = play(
-            stored._replace(agent=dataclasses.replace(stored.agent, config=config)),
+            dataclasses.replace(stored, agent=dataclasses.replace(stored.agent, config=config)),
             episodes=options.episodes,
             num_envs=options.num_envs,
             seed=options.seed,

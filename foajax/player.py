@@ -22,11 +22,12 @@ from foajax.viewing.recording import play, progress_bar
 class Options:
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
+    run: str  # a directory of a run or an agent, or the name of a shipped agent
     out: str = "player"  # directory of the page
     policy: Literal["sampled", "greedy"] = "sampled"
     seed: int = 0
     steps: int | None = None  # cuts the game after so many decisions; null for the whole game
+    trust: bool = False  # whether code that the agent's configuration names may run
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
@@ -37,7 +38,7 @@ def player(arguments: Sequence[str]) -> None:
     """The command; prints the path of the page."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored, directory = load_agent(options.run), cli.make_directory(options.out)
+    stored, directory = load_agent(options.run, trust=options.trust), cli.make_directory(options.out)
     with progress_bar() as bar:
         greedy = options.policy == "greedy"
         recording = next(play(stored, bar, seed=options.seed, greedy=greedy, max_steps=options.steps))

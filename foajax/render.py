@@ -26,7 +26,7 @@ from foajax.viewing.video import has_ffmpeg, write_video
 class Options:
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
+    run: str  # a directory of a run or an agent, or the name of a shipped agent
     out: str | None = None  # directory; null for render/ in the run's
     episodes: int = 1
     policy: Literal["sampled", "greedy"] = "sampled"
@@ -34,6 +34,7 @@ class Options:
     steps: int | None = None  # cuts a game after so many decisions; null for whole games
     format: Literal["mp4", "gif"] | None = None  # null for mp4 where it can be written
     video: bool = True  # false for the heat map alone
+    trust: bool = False  # whether code that the agent's configuration names may run
 
     def __post_init__(self) -> None:
         for key in ("episodes", "steps"):
@@ -48,7 +49,7 @@ def render(arguments: Sequence[str]) -> None:
     """The command; prints the paths of what it wrote."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored = load_agent(options.run)
+    stored = load_agent(options.run, trust=options.trust)
     directory = cli.make_directory(options.out or Path(options.run) / "render")
     suffix = options.format or ("mp4" if has_ffmpeg() else "gif")
     recordings, written = [], []

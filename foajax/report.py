@@ -32,6 +32,7 @@ class Options:
     preset: Literal["constant", "decreasing", "peripheral"] | None = None
     episodes: int = 3  # games for a heat map that has to be made; 0 for none
     repeats: int = 50  # of each timing of a decision; 0 for no costs
+    trust: bool = False  # whether code that the runs' configurations name may run
 
     def __post_init__(self) -> None:
         for key in ("episodes", "repeats"):
@@ -47,7 +48,7 @@ def report(arguments: Sequence[str]) -> None:
     if not paths:
         raise ConfigError("no runs: accepted is report runs/<a> runs/<b> ... out=report")
     wait_in_place()
-    runs = [read_run(path) for path in dict.fromkeys(map(Path, paths))]
+    runs = [read_run(path, trust=options.trust) for path in dict.fromkeys(map(Path, paths))]
     games = games_of(runs, options.preset)
     shown = {run.path for run in runs_of(games)}
     if others := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:

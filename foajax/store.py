@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 from foajax import cli
 from foajax.config.parse import ConfigError
-from foajax.runs.agents import FACTS, Stored, load_agent, load_score, save_agent
+from foajax.runs.agents import FACTS, TrainedAgent, load_agent, load_score, save_agent
 from foajax.runs.directory import PARAMETERS
 
 
-def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
+def _read_score(file: Path, stored: TrainedAgent) -> dict[str, Any]:
     config = stored.agent.config
     expected = {"game": config.game, "experiment": config.name, "env_steps": stored.env_steps}
     try:
@@ -40,12 +40,13 @@ class Options:
     out: str
     checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     score: str | None = None  # file that `evaluate json=` has written, to go with the agent
+    trust: bool = False  # whether code that the run's configuration names may run
 
 
 def export(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
-    stored = load_agent(options.run, best=options.checkpoint == "best")
+    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
     score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)
     save_agent(stored, Path(options.out), score)
     print(f"{options.out}: {PARAMETERS}, config.yaml, {FACTS}")

@@ -95,6 +95,8 @@ def build(cls: Any, value: Any, key: str) -> Any:
 
 def _convert(hint: Any, value: Any, key: str) -> Any:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
     if origin in (typing.Union, types.UnionType):
         if all(map(dataclasses.is_dataclass, args)):
             return _build_kind(args, value, key)
@@ -137,12 +139,15 @@ def _convert(hint: Any, value: Any, key: str) -> Any:
 
 
 def _build_kind(classes: Sequence[Any], value: Any, key: str) -> Any:
-    """One of several dataclasses, told apart by their `kind`; the first where none is named."""
-    kinds = {each.kind: each for each in classes}
-    kind = value.get("kind", classes[0].kind) if isinstance(value, Mapping) else None
-    if isinstance(value, Mapping) and not (isinstance(kind, str) and kind in kinds):
-        raise ConfigError(f"{key}.kind={brief(kind)}: accepted is one of {', '.join(kinds)}")
-    return build(kinds.get(str(kind), classes[0]), value, key)
+    """One of several dataclasses, told apart by their `kind`; the first where none is named, the last for code."""
+    *named, own = classes
+    kinds = {each.kind: each for each in named}
+    kind = value.get("kind", named[0].kind) if isinstance(value, Mapping) else named[0].kind
+    if isinstance(kind, str) and ":" in kind:
+        return build(own, value, key)
+    if not (isinstance(kind, str) and kind in kinds):
+        raise ConfigError(f"{key}.kind={brief(kind)}: accepted is one of {', '.join(kinds)} or package.module:Class")
+    return build(kinds[kind], value, key)
 
 
 def describe(hint: Any) -> str:
@@ -157,7 +162,7 @@ def describe(hint: Any) -> str:
             return f"a list of {describe(args[0])}"
         return "[" + ", ".join(describe(a) for a in args) + "]"
     if origin is not None:
-        return f"a mapping to {describe(args[1])}"
+        return "a mapping" if args[1] is Any else f"a mapping to {describe(args[1])}"
     plain = {
         int: "an integer",
         float: "a number (0, or of 1e-37 to 1e38)",

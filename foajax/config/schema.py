@@ -24,6 +24,8 @@ class RingSensor:
     peripheral: tuple[int, int] | None = None  # grid of the coarse background, e.g. (5, 5)
     layout: Literal["canvas", "packed"] = "canvas"
     pooling: Literal["mean", "stride"] = "mean"
+    size_key: ClassVar[str] = "sensor.rings"  # what decides how large the focal area is
+    may_overhang: ClassVar[bool] = False  # whether the area may be larger than the frame where gaze.bounds=point
 
     def __post_init__(self) -> None:
         check_types(self, "sensor")
@@ -58,6 +60,8 @@ class LogPolarSensor:
     fovea: float = 3.0  # radius of the innermost ring, a disc, frame pixels
     radius: float = 40.0  # outer radius, frame pixels
     sampling: Literal["area", "bilinear"] = "area"
+    size_key: ClassVar[str] = "sensor.radius"
+    may_overhang: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_types(self, "sensor")
@@ -74,7 +78,18 @@ class LogPolarSensor:
         return side, side
 
 
-Sensor = RingSensor | LogPolarSensor
+@dataclasses.dataclass(frozen=True)
+class OwnSensor:
+    """A sensor from elsewhere; see `foajax.sensors.base.Sensor`. It is made, and checked, where it is first used."""
+
+    kind: str  # package.module:Class
+    kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of its constructor
+    size_key: ClassVar[str] = "sensor.kwargs"
+    may_overhang: ClassVar[bool] = True
+    window: ClassVar[None] = None  # not known before it is made
+
+
+SensorConfig = RingSensor | LogPolarSensor | OwnSensor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +156,11 @@ class EnvConfig:
 class NetworkConfig:
     """Sizes of the network."""
 
-    torso: Literal["nature", "a3c"] = "nature"
+    torso: str = "nature"  # nature, a3c, impala, or a Flax module of one's own: package.module:Class
+    widths: tuple[int, ...] | None = None  # channels of the torso's layers; null for its own
+    torso_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # further arguments of the torso
+    core: str = "lstm"  # lstm, gru, mingru, none (no memory), or one's own: package.module:Class
+    core_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # further arguments of the core
     dense: int = 256  # units between torso and LSTM; 0 for none
     dense_norm: bool = False  # layer norm of what enters these units
     lstm: int = 256
@@ -157,6 +176,11 @@ class NetworkConfig:
     normalization: Literal["pixel", "running", "frame", "none"] = "pixel"
 
     def __post_init__(self) -> None:
+        for key, ours in (("torso", ("nature", "a3c", "impala")), ("core", ("lstm", "gru", "mingru", "none"))):
+            name, accepted = getattr(self, key), f"one of {', '.join(ours)} or package.module:Class"
+            check(name in ours or ":" in name, f"network.{key}", name, accepted)
+        widths = self.widths is None or (len(self.widths) > 0 and 1 <= min(self.widths) <= max(self.widths) <= 16_384)
+        check(widths, "network.widths", self.widths, "null or a list of integers from 1 to 16384")
         check(0 <= self.dense <= 16_384, "network.dense", self.dense, "an integer from 0 to 16384")
         check(1 <= self.lstm <= 16_384, "network.lstm", self.lstm, "an integer from 1 to 16384")
         check(abs(self.forget_bias) <= 100, "network.forget_bias", self.forget_bias, "a number from -100 to 100")
@@ -278,7 +302,7 @@ class Config:
     """One run."""
 
     name: str  # of the experiment, e.g. constant70
-    sensor: Sensor
+    sensor: SensorConfig
     game: str = "breakout"
     seed: int = 0
     run: str | None = None  # run directory; null for runs/<game>-<name>-s<seed>
@@ -295,26 +319,12 @@ class Config:
         check(self.game.strip() != "", "game", repr(self.game), "the name of a game")
         check(0 <= self.seed < 2**31 - 10_000, "seed", self.seed, "an integer from 0 to 2147473647")
         height, width = self.env.frame_shape
-        if self.gaze.bounds == "window" or isinstance(self.sensor, RingSensor):
-            fits = self.sensor.window[0] <= height and self.sensor.window[1] <= width
-            check(
-                fits,
-                "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius",
-                self.sensor.window,
-                f"a focal area inside env.frame_shape={height}x{width}",
-            )
-        if isinstance(self.sensor, RingSensor) and self.sensor.peripheral is not None:
-            rows, columns = self.sensor.peripheral
-            check(
-                rows <= height and columns <= width,
-                "sensor.peripheral",
-                self.sensor.peripheral,
-                f"a grid no finer than env.frame_shape={height}x{width}",
-            )
-        if self.gaze.mode in ("learned", "random") and self.gaze.bounds == "window":
-            key = "sensor.rings" if isinstance(self.sensor, RingSensor) else "sensor.radius"
-            accepted = f"point, or gaze=none: {key} fills env.frame_shape={height}x{width} and could not move"
-            check(self.sensor.window != (height, width), "gaze.bounds", self.gaze.bounds, accepted)
+        if self.sensor.window is not None:
+            check_window(self, self.sensor.window)
+        peripheral = getattr(self.sensor, "peripheral", None)
+        accepted = f"a grid no finer than env.frame_shape={height}x{width}"
+        fits = peripheral is None or (peripheral[0] <= height and peripheral[1] <= width)
+        check(fits, "sensor.peripheral", peripheral, accepted)
         points = self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ())
         for point in points:
             check(
@@ -344,9 +354,32 @@ class Config:
         check(rollouts <= most, "train.env_steps", self.train.env_steps, accepted)
 
     @property
+    def code(self) -> list[str]:
+        """What of it names code outside of foajax, which runs where the part is made."""
+        names = {"game": self.game, "sensor.kind": self.sensor.kind}
+        names |= {"network.torso": self.network.torso, "network.core": self.network.core}
+        ours = ("probe:", "gymnasium:ale_py:")
+        return [
+            f"{key}={name}"
+            for key, name in names.items()
+            if ":" in name.removeprefix("gymnasium:") and not name.startswith(ours)
+        ]
+
+    @property
     def run_dir(self) -> str:
         """Where the run's files are."""
         return self.run or f"runs/{file_name(self.game)}-{self.name}-s{self.seed}"
+
+
+def check_window(config: Config, window: tuple[int, int]) -> None:
+    """`ConfigError` unless the sensor's focal area fits into the frame and the gaze can move it."""
+    (height, width), key = config.env.frame_shape, config.sensor.size_key
+    if config.gaze.bounds == "window" or not config.sensor.may_overhang:
+        accepted = f"a focal area inside env.frame_shape={height}x{width}"
+        check(window[0] <= height and window[1] <= width, key, window, accepted)
+    if config.gaze.mode in ("learned", "random") and config.gaze.bounds == "window":
+        accepted = f"point, or gaze=none: {key} fills env.frame_shape={height}x{width} and could not move"
+        check(window != (height, width), "gaze.bounds", config.gaze.bounds, accepted)
 
 
 def check_address(key: str, value: str) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from foajax.config.parse import ConfigError
+from foajax.config.parts import make_part
 from foajax.config.schema import NetworkConfig
 
 RELU_GAIN = math.sqrt(2.0)  # keeps the variance through a ReLU (He et al. 2015)
@@ -30,12 +33,14 @@ class NatureTorso(nn.Module):
     there, and the maps of the others are padded with zeros.
     """
 
+    widths: Sequence[int] = (32, 64, 64)
     covers: bool = True
 
     @nn.compact
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
         first = (8, 4) if min(x.shape[1:3]) >= 44 else (4, 2)
-        for layer, (features, (kernel, stride)) in enumerate(((32, first), (64, (4, 2)), (64, (3, 1)))):
+        layers = zip(self.widths, (first, (4, 2), (3, 1)), strict=True)
+        for layer, (features, (kernel, stride)) in enumerate(layers):
             if min(x.shape[1:3]) < kernel:
                 continue
             height = width = kernel
@@ -54,9 +59,12 @@ class A3CTorso(nn.Module):
     Maps of 4x4 and less are not pooled further, which on an 80x80 canvas changes nothing.
     """
 
+    widths: Sequence[int] = (32, 32, 64, 64)
+
     @nn.compact
     def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
-        for layer, (features, kernel, border) in enumerate(((32, 5, 2), (32, 5, 1), (64, 4, 1), (64, 3, 1))):
+        layers = zip(self.widths, (5, 5, 4, 3), (2, 1, 1, 1), strict=True)
+        for layer, (features, kernel, border) in enumerate(layers):
             x = jnp.pad(x, ((0, 0), (border, border), (border, border), (0, 0)))
             x = convolution(features, (kernel, kernel), name=f"Convolution_{layer}")(x)
             x = nn.relu(max_pool(x) if min(x.shape[1:3]) > 4 else x)
@@ -75,8 +83,43 @@ def max_pool(x: Float[Array, "N H W C"]) -> Float[Array, "N h w C"]:
     return jnp.maximum(x[:, :, 0::2], x[:, :, 1::2])
 
 
+class ImpalaTorso(nn.Module):
+    """The residual torso of Espeholt et al. (2018): per width a 3x3 convolution, a 3x3/2 max-pool and two blocks.
+
+    For accelerators: on a CPU it takes many times as long as the others.
+    """
+
+    widths: Sequence[int] = (16, 32, 32)
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
+        for width in self.widths:
+            x = nn.max_pool(convolution(width, (3, 3), padding="SAME")(x), (3, 3), (2, 2), "SAME")
+            for _ in range(2):
+                inner = convolution(width, (3, 3), padding="SAME")(nn.relu(x))
+                x = x + convolution(width, (3, 3), padding="SAME")(nn.relu(inner))
+        return nn.relu(x).reshape(x.shape[0], -1)
+
+
+TORSOS = {"nature": NatureTorso, "a3c": A3CTorso, "impala": ImpalaTorso}  # by `network.torso`
+
+
 def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
-    """The torso of one image."""
-    if config.torso == "a3c":
-        return A3CTorso(name=name)
-    return NatureTorso(covers=config.padding == "cover", name=name)
+    """The torso of one image.
+
+    Raises:
+      ConfigError: `network.torso` names code that cannot be found, takes other arguments or is no Flax module; or
+        `network.widths` are not as many as it has layers.
+    """
+    arguments: dict[str, Any] = {**config.torso_kwargs, "name": name}
+    if config.torso == "nature":
+        arguments["covers"] = config.padding == "cover"
+    if config.widths is not None:
+        arguments["widths"] = config.widths
+    made = make_part("network.torso", config.torso, TORSOS, **arguments)
+    if not isinstance(made, nn.Module):
+        raise ConfigError(f"network.torso={config.torso}: accepted is a Flax module")
+    if isinstance(made, NatureTorso | A3CTorso) and len(made.widths) != len(type(made).widths):
+        accepted = f"{len(type(made).widths)} numbers for network.torso={config.torso}"
+        raise ConfigError(f"network.widths={list(made.widths)}: accepted are {accepted}")
+    return made
