@@ -125,10 +125,11 @@ def test_the_gate_that_keeps_begins_open(name):
 class Sum(nn.Module):
     """A core of one's own: the sum of all inputs since the episode began."""
 
+    width: int
     scale: float = 1.0
 
     def initial_state(self, batch):
-        return {"sum": jnp.zeros((batch, F))}
+        return {"sum": jnp.zeros((batch, self.width))}
 
     def __call__(self, inputs, is_first, state):
         outputs = []
@@ -150,17 +151,19 @@ HERE = "test_cores"
 
 
 def test_a_network_of_ones_own_parts():
-    words = [f"network.torso={HERE}:Mean", f"network.core={HERE}:Sum", "network.core_kwargs.scale=2", "network.dense=0"]
-    agent = Agent(compose(["experiment=constant70_packed", "network.last_actions=false", *words]), 4, None)
+    words = ["network.dense=0", "network.last_actions=false", f"network.torso={HERE}:Mean", f"network.core={HERE}:Sum"]
+    words += ["network.core_kwargs.width=4", "network.core_kwargs.scale=2"]  # the mean, focal point and last reward
+    agent = Agent(compose(["experiment=constant70_packed", *words]), 4, None)
     params = agent.initial_params(jax.random.key(0))
     assert sorted(params["params"]) == ["natural_policy", "natural_value", "vision_policy", "vision_value"]
-    assert agent.network.apply is not None and agent.config.network.core_kwargs == {"scale": 2}
+    assert jax.tree.map(jnp.shape, agent.initial_state(2).core_state) == {"sum": (2, 4)}
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
         ("core", f"{HERE}:Nothing", "network.core=test_cores:Nothing: accepted is package.module:Name"),
+        ("core", f"{HERE}:Sum", r"network.core=test_cores:Sum: accepted are the arguments of .* 'width'"),
         ("core", f"{HERE}:Mean", "network.core=test_cores:Mean: accepted is a Flax module with the methods of a Core"),
         ("core", "no_such_module:Core", "network.core=no_such_module:Core: accepted is package.module:Name"),
         ("core_kwargs", {"depth": 2}, r"network.core=lstm: accepted are the arguments of .* \(got an unexpected"),

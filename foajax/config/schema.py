@@ -133,6 +133,7 @@ class EnvConfig:
     max_episode_steps: int = 27_000  # agent steps
     threads: int = 0  # of the engine; 0 lets it choose
     timeout: float = 120.0  # seconds that a step may take before the engine is taken for hung
+    kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of a Gymnasium environment or one's own
 
     def __post_init__(self) -> None:
         check(1 <= self.num_envs <= 100_000, "env.num_envs", self.num_envs, "an integer from 1 to 100000")
