@@ -39,9 +39,8 @@ def atari_name(game: str, known: Iterable[str]) -> str:
         return names[game]
     near = difflib.get_close_matches(game.lower(), [*names, *OWN], n=3)
     hint = f"; near: {', '.join(near)}" if near else ""
-    raise ConfigError(
-        f"game={game}: accepted is an Atari game (breakout), {', '.join(OWN)}, gymnasium:<id> or package.module:factory{hint}"
-    )
+    others = f"{', '.join(OWN)}, gymnasium:<id> or package.module:factory"
+    raise ConfigError(f"game={game}: accepted is an Atari game (breakout), {others}{hint}")
 
 
 def envpool_id(name: str) -> str:
