@@ -9,8 +9,7 @@ import jax
 
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config
-from foajax.launch import launch
-from foajax.launch import processes as distributed
+from foajax.launch import launch, processes
 from foajax.runtime import keep_memory, use_compilation_cache
 from foajax.training.start import check, start
 from foajax.training.watchdog import EnvironmentFault, report_fault
@@ -26,15 +25,15 @@ def train(config: Config) -> int:
     try:
         start(config)
     except EnvironmentFault as fault:
-        return distributed.leave(report_fault(config, str(fault), fault))
+        return processes.leave(report_fault(config, str(fault), fault))
     except Exception as error:
         if not jax.distributed.is_initialized():
             raise
         if isinstance(error, ConfigError):
             print(f"foajax: error: {error}", file=sys.stderr, flush=True)
-            return distributed.leave(2)
+            return processes.leave(2)
         traceback.print_exc()
-        return distributed.leave(1)
+        return processes.leave(1)
     return 0
 
 

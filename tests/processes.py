@@ -20,6 +20,7 @@ TINY = [
     "env.num_envs=8",
     "learner.minibatches=2",
     "learner.rollout_length=5",
+    "learner.schedule=constant",  # so that a run may be made longer
     "train.log_every=0.01",
 ]
 

@@ -10,7 +10,7 @@ from foajax.config.parse import ConfigError
 from foajax.config.schema import Config, check_window
 from foajax.envs.atari import check_game
 from foajax.envs.make import make_environments
-from foajax.launch import processes as distributed
+from foajax.launch import processes
 from foajax.launch.signals import StopRequest
 from foajax.runs.agents import TrainedAgent, check_source, load_agent
 from foajax.runs.directory import is_run, open_run
@@ -45,14 +45,14 @@ def start(config: Config) -> None:
     check(config)
     with contextlib.ExitStack() as resources:
         if config.profile:
-            if config.train.devices > 1 or distributed.where(config):
+            if config.train.devices > 1 or processes.where(config):
                 raise ConfigError("profile=true: accepted is train.devices=1 and a single process")
             environments = make_environments(config, 0)
             for environment in environments:
                 resources.callback(environment.close)
             profiling.profile(config, environments, f"{config.run_dir}/profile")
             return
-        job = distributed.start(config)
+        job = processes.start(config)
         job.agree(config)
         if config.train.dump_skipped and len(job.devices) > 1:
             raise ConfigError("train.dump_skipped=true: accepted is false where a run has several devices")

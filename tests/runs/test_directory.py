@@ -24,7 +24,7 @@ from foajax.runs import provenance
 from foajax.runs.directory import load_config, open_run
 from foajax.runs.lock import RunError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 COMMAND = ["python", "-m", "foajax.train", "game=breakout"]
 
 

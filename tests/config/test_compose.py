@@ -21,7 +21,7 @@ from foajax.config.schema import Config, HeadConfig, LogPolarSensor, RingSensor
 from foajax.launch import sweep
 from foajax.launch.launch import run
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 # Table II: window, values, peripheral. The peripheral adds at most its 16 outer cells of 25.
 TABLE_II = {

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from processes import TINY, finish, newest, rows, start, wait_for
 from safetensors.numpy import load_file
-from test_checkpoint import Trap, damage_last_byte
+from test_checkpoints import Trap, damage_last_byte
 
 from foajax import cli, store
 from foajax.runs import durable

@@ -23,7 +23,7 @@ from foajax.runs.logger import Logger
 from foajax.training.episodes import EpisodeTracker
 from foajax.types import Outcome
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def start(run_dir: Path, env_steps: int = 0) -> Logger:

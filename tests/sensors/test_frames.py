@@ -76,7 +76,7 @@ def test_crop_outside_the_screen_is_refused(crop_top):
 
 
 def test_recorded_screen_gives_the_recorded_frame(maybe_jit):
-    screen = np.load(Path(__file__).parent / "data" / "breakout_screen.npz")["screen"]
+    screen = np.load(Path(__file__).parents[1] / "data" / "breakout_screen.npz")["screen"]
     frame = maybe_jit(lambda s: frames.to_frame(s, 34))(jnp.asarray(screen))
     sums = np.round(1020 * np.asarray(frame)).astype("<u2")
     assert hashlib.sha256(sums.tobytes()).hexdigest() == BREAKOUT_SHA256

@@ -21,7 +21,7 @@ from foajax.runs.agents import load_agent
 from foajax.runs.directory import failure
 from foajax.training.watchdog import FAULT, EnvironmentFault, Watchdog
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 
 _SCRIPT = """
 import signal, time

@@ -16,7 +16,7 @@ import pytest
 
 from foajax.runs.display import Display
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 ROWS = (
     {"env_steps": 1_000_000, "time": 900.0, "score": 1.5, "natural_entropy": 1.25, "games": 12345},
     {"env_steps": 2_500_000, "time": 1900.0, "score": None, "natural_entropy": 1e-7, "games": 12346},

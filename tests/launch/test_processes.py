@@ -214,7 +214,7 @@ def test_a_collective_that_fails_ends_a_process_whatever_it_raises(monkeypatch, 
 @pytest.mark.parametrize("fault", ["raise:make", "raise:step", "hang:step"])
 def test_a_process_whose_environment_fails_says_so_and_the_others_save(tmp_path, monkeypatch, fault):
     """Soon: an orderly end would wait for the others, as they for it."""
-    tests = Path(__file__).parent
+    tests = Path(__file__).parents[1]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tests.parent), str(tests)]))
     words = ["game=gymnasium:faulty:Faulty-v0", "env.timeout=5", "train.env_steps=1000", f"run={tmp_path / 'run'}"]
     started = start_job(2, *words, last={"FAULTY": fault})

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loops import VIEW, Loop
 from safetensors import safe_open
 from safetensors.numpy import load_file
-from test_learner import VIEW, Loop
 
 from foajax.runs.agents import named
 from foajax.training.dump import Dump

@@ -38,5 +38,5 @@ EDGES = [
 @pytest.mark.parametrize("words", EDGES, ids=" ".join)
 def test_an_engine_survives_the_edges_of_what_is_accepted(engine, words):
     command = [sys.executable, "-c", _PLAY, f"env.engine={engine}", *words]
-    result = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, timeout=300)
+    result = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=300)
     assert (result.returncode, result.stdout) == (0, "played\n"), result.stderr

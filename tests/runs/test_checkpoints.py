@@ -26,7 +26,7 @@ from foajax.config.parse import ConfigError
 from foajax.runs import durable
 from foajax.runs.checkpoints import CheckpointError, Checkpoints
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 class State(NamedTuple):
@@ -492,7 +492,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.parametrize("claimed", [True, False], ids=["noticed before", "noticed by Orbax"])
 def test_a_full_disk_costs_one_checkpoint_and_one_line(small_disk, monkeypatch, told, claimed):
     if not claimed:
-        monkeypatch.setattr(checkpoint, "_claim", lambda path, size: None)
+        monkeypatch.setattr("foajax.runs.checkpoints._claim", lambda path, size: None)
     noise = np.random.default_rng(0).random(220_000)  # does not compress
     ballast = small_disk / "ballast"
     with Checkpoints(small_disk / "checkpoints", keep=3, warn=told.append) as checkpoints:
