@@ -130,11 +130,12 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False) -> 
     check_trust(path, config, trust)
     try:
         facts = json.loads((path / FACTS).read_text())
-        agent = Agent(config, facts["num_actions"], facts["crop_top"])
+        num_actions, crop_top = facts["num_actions"], facts["crop_top"]
     except (OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"run={path}: {FACTS} is missing or not readable; accepted is a run or an agent") from None
-    if not isinstance(agent.num_actions, int) or agent.num_actions < 1:
-        raise ConfigError(f"run={path}: {FACTS} has num_actions={agent.num_actions}; accepted is an integer >= 1")
+    if not isinstance(num_actions, int) or num_actions < 1:
+        raise ConfigError(f"run={path}: {FACTS} has num_actions={num_actions}; accepted is an integer >= 1")
+    agent = Agent(config, num_actions, crop_top)
     if (path / PARAMETERS).exists():
         return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
     template = jax.eval_shape(lambda: make_state(agent, 0))

@@ -14,6 +14,7 @@ from foajax.launch import processes
 from foajax.launch.signals import StopRequest
 from foajax.runs.agents import TrainedAgent, check_source, load_agent
 from foajax.runs.directory import is_run, open_run
+from foajax.runtime import use_compilation_cache
 from foajax.sensors.registry import make_sensor
 from foajax.training import profiling
 from foajax.training.run import Run
@@ -73,7 +74,7 @@ def start(config: Config) -> None:
 def train_agent(config: Config) -> TrainedAgent:
     """Trains one agent, or goes on training it, in this process; gives it as its newest checkpoint has it.
 
-    As `python -m foajax.train` does, it writes to `config.run_dir` and prints to stderr. It may be called from any
+    As `python -m foajax.train` does, it writes to `config.run_dir`, prints to stderr and keeps compiled programs. It may be called from any
     thread; in the main one, SIGINT, SIGTERM and SIGUSR1 end it early, with all that was learned saved. An environment
     that hangs for longer than `env.timeout` ends the process.
 
@@ -84,5 +85,6 @@ def train_agent(config: Config) -> TrainedAgent:
       ConfigError: a run that cannot be made, or a directory that is another run's; one line for the user.
       EnvironmentFault: an environment raised; what was learned is saved.
     """
+    use_compilation_cache()
     start(config)
     return load_agent(config.run_dir, trust=True)

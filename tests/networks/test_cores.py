@@ -168,7 +168,7 @@ def test_a_network_of_ones_own_parts():
         ("core", "no_such_module:Core", "network.core=no_such_module:Core: accepted is package.module:Name"),
         ("core_kwargs", {"depth": 2}, r"network.core=lstm: accepted are the arguments of .* \(got an unexpected"),
         ("torso", f"{HERE}:B", "network.torso=test_cores:B: accepted is package.module:Name of something to call"),
-        ("torso", f"{HERE}:made", "network.torso=test_cores:made: accepted are the arguments of"),
+        ("torso", f"{HERE}:gru", "network.torso=test_cores:gru: accepted are the arguments of"),
         ("widths", (32, 64), r"network.widths=\[32, 64\]: accepted are 3 numbers for network.torso=nature"),
     ],
 )
