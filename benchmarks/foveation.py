@@ -25,7 +25,7 @@ from pydantic import Field
 from foajax import cli, runtime
 from foajax.config.compose import compose
 from foajax.config.parse import Section
-from foajax.config.schema import LogPolarSensor, RingSensor, Sensor
+from foajax.config.schema import LogPolarSensor, RingSensor, SensorConfig
 from foajax.sensors.sense import sense
 from foajax.viewing.sheet import PAPER
 
@@ -33,7 +33,7 @@ TABLE_II = {name: compose([f"experiment={name}"]).sensor for name in PAPER}
 CONSTANT70_PACKED = RingSensor(((70, 70, 2),), layout="packed")
 
 
-def sensors() -> dict[str, Sensor]:
+def sensors() -> dict[str, SensorConfig]:
     """Every sensor of Table II on the canvas and packed, and the log-polar ones."""
     packed = {
         f"{name} packed": RingSensor(s.rings, peripheral=s.peripheral, layout="packed") for name, s in TABLE_II.items()
@@ -62,7 +62,7 @@ def batch(size: int, shape: tuple[int, int] = (80, 80)) -> tuple[np.ndarray, np.
     return rng.normal(size=(size, *shape)).astype(np.float32), rng.integers(35, 46, (size, 2)).astype(np.int32)
 
 
-def sensing(sensor: Sensor, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
+def sensing(sensor: SensorConfig, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
     """A compiled call on arrays in the device's memory; vmapped where there is a batch."""
     run = functools.partial(sense, sensor=sensor, bounds="window")
     compiled = jax.jit(jax.vmap(run) if frames.ndim == 3 else run)

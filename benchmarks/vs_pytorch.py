@@ -32,7 +32,6 @@ from foajax.config.schema import Config, NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.learning.optimizer import make_optimizer
 from foajax.runtime import keep_memory
-from foajax.sensors.sense import image_shapes
 from foajax.types import CoreState, NetworkOutput
 
 STEPS = 21  # T + 1
@@ -142,10 +141,10 @@ class Inputs(NamedTuple):
     is_first: np.ndarray  # [T+1, B]
 
     @classmethod
-    def make(cls, config: Config, batch: int) -> Inputs:
+    def make(cls, agent: Agent, batch: int) -> Inputs:
         """Noise."""
         random = np.random.default_rng(0)
-        shapes = image_shapes(config.sensor, config.env.frame_shape)
+        shapes = agent.image_shapes
         return cls(
             roi=[random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in shapes],
             focal_point=random.uniform(-1, 1, (STEPS, batch, 2)).astype(np.float32),
@@ -226,7 +225,7 @@ def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
     """One experiment on both sides."""
     agent = Agent(config, ACTIONS, None)
     params = agent.initial_params(jax.random.key(0))
-    inputs = Inputs.make(config, options.num_envs)
+    inputs = Inputs.make(agent, options.num_envs)
     sides = our_calls(agent, params, inputs), their_calls(agent, params, inputs)
     for mine, other in zip(*(calls["forward"]() for calls in sides), strict=True):
         np.testing.assert_allclose(mine, other.numpy(), atol=2e-4)

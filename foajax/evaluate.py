@@ -34,7 +34,7 @@ _PROTOCOL = (
 class Options(Section):
     """What the command takes."""
 
-    run: str = Field(description="A run directory or a shipped agent.")
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     episodes: int = Field(100, ge=1, description="Games to play.")
     policy: Literal["sampled", "greedy"] = Field(
         "sampled", description="Greedy games that begin alike are alike: 31 ways with no-ops."
@@ -45,6 +45,7 @@ class Options(Section):
     json_file: str | None = Field(None, alias="json", description="File for the result.")
     num_envs: int = Field(25, ge=1, description="Games played at once.")
     seed: int = Field(0, description="Seed of the games.")
+    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
     def check(self) -> None:
         cli.check_file("json", self.json_file)
@@ -54,13 +55,13 @@ def evaluate(arguments: Sequence[str]) -> None:
     """The command."""
     protocol = [word for word in arguments if word.startswith("env.")]
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
-    stored = load_agent(options.run, best=options.checkpoint == "best")
+    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
     env = cli.override(stored.agent.config.env, protocol, "env", _PROTOCOL)
     config = replace(stored.agent.config, env=env)
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("games", total=options.episodes)
         games = play(
-            stored._replace(agent=dataclasses.replace(stored.agent, config=config)),
+            dataclasses.replace(stored, agent=dataclasses.replace(stored.agent, config=config)),
             episodes=options.episodes,
             num_envs=options.num_envs,
             seed=options.seed,

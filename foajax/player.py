@@ -22,18 +22,19 @@ from foajax.viewing.recording import play, progress_bar
 class Options(Section):
     """What the command takes."""
 
-    run: str = Field(description="A run directory or a shipped agent.")
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str = Field("player", description="Directory of the page.")
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
     seed: int = Field(0, description="Seed of the game.")
     steps: int | None = Field(None, ge=1, description="Cut the game after so many decisions; null for the whole game.")
+    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
 
 def player(arguments: Sequence[str]) -> None:
     """The command; prints the path of the page."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored, directory = load_agent(options.run), cli.make_directory(options.out)
+    stored, directory = load_agent(options.run, trust=options.trust), cli.make_directory(options.out)
     with progress_bar() as bar:
         greedy = options.policy == "greedy"
         recording = next(play(stored, bar, seed=options.seed, greedy=greedy, max_steps=options.steps))

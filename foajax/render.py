@@ -26,7 +26,7 @@ from foajax.viewing.video import has_ffmpeg, write_video
 class Options(Section):
     """What the command takes."""
 
-    run: str = Field(description="A run directory or a shipped agent.")
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str | None = Field(None, description="Directory of the files; null for render/ in the run's.")
     episodes: int = Field(1, ge=1, description="Games to play.")
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
@@ -34,6 +34,7 @@ class Options(Section):
     steps: int | None = Field(None, ge=1, description="Cut a game after so many decisions; null for whole games.")
     format: Literal["mp4", "gif"] | None = Field(None, description="Of videos; null for mp4 where that can be written.")
     video: bool = Field(True, description="Write videos; false for the heat map alone.")
+    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
     def check(self) -> None:
         if self.format == "mp4" and not has_ffmpeg():
@@ -44,7 +45,7 @@ def render(arguments: Sequence[str]) -> None:
     """The command; prints the paths of what it wrote."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored = load_agent(options.run)
+    stored = load_agent(options.run, trust=options.trust)
     directory = cli.make_directory(options.out or Path(options.run) / "render")
     suffix = options.format or ("mp4" if has_ffmpeg() else "gif")
     recordings, written = [], []

@@ -33,6 +33,7 @@ class Options(Section):
     )
     episodes: int = Field(3, ge=0, description="Games for a heat map that has to be made; 0 for none.")
     repeats: int = Field(50, ge=0, description="Repeats of each timing of a decision; 0 for no costs.")
+    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -43,7 +44,7 @@ def report(arguments: Sequence[str]) -> None:
     if not paths:
         raise refuse("no runs", accepted="report runs/<a> runs/<b> ... out=report")
     wait_in_place()
-    runs = [read_run(path) for path in dict.fromkeys(map(Path, paths))]
+    runs = [read_run(path, trust=options.trust) for path in dict.fromkeys(map(Path, paths))]
     games = games_of(runs, options.preset)
     shown = {run.path for run in runs_of(games)}
     if others := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:

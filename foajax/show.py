@@ -24,6 +24,7 @@ from foajax.config.parse import Section, refuse
 from foajax.config.schema import Config, Point
 from foajax.envs.make import make
 from foajax.sensors.frames import to_frame
+from foajax.sensors.registry import make_sensor
 from foajax.viewing.sheet import ALL, contact_sheet, draw, save
 
 
@@ -74,9 +75,9 @@ def show(arguments: Sequence[str]) -> None:
             raise refuse("points", f"[{y}, {x}]", f"[y, x] inside the frame, {height}x{width}")
     frame = play(config, options.steps)
     if sheet:
-        image = contact_sheet(frame, {name: each.sensor for name, each in configs.items()}, points)
+        image = contact_sheet(frame, {name: make_sensor(each.sensor) for name, each in configs.items()}, points)
     else:
-        image = draw(frame, config.sensor, points, name=options.sensor)
+        image = draw(frame, make_sensor(config.sensor), points, name=options.sensor)
     save(image, options.out)
     print(options.out)
 

@@ -15,11 +15,11 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import Section, refuse
-from foajax.runs.agents import FACTS, Stored, load_agent, load_score, save_agent
+from foajax.runs.agents import FACTS, TrainedAgent, load_agent, load_score, save_agent
 from foajax.runs.directory import PARAMETERS
 
 
-def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
+def _read_score(file: Path, stored: TrainedAgent) -> dict[str, Any]:
     config = stored.agent.config
     expected = {"game": config.game, "experiment": config.name, "env_steps": stored.env_steps}
     try:
@@ -36,18 +36,19 @@ def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
 class Options(Section):
     """What the command takes."""
 
-    run: str = Field(description="A run directory or a shipped agent.")
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str = Field(description="Directory of the agent.")
     checkpoint: Literal["newest", "best"] = Field(
         "newest", description="Of a run: the latest, or that with the best score in training."
     )
     score: str | None = Field(None, description="File that `evaluate json=` has written, to go with the agent.")
+    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
 
 
 def export(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
-    stored = load_agent(options.run, best=options.checkpoint == "best")
+    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
     score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)
     save_agent(stored, Path(options.out), score)
     print(f"{options.out}: {PARAMETERS}, config.yaml, {FACTS}")

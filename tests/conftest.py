@@ -37,13 +37,13 @@ def no_process_is_left():
 @pytest.fixture(scope="session")
 def untrained():
     """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
-    from foajax.runs.agents import Stored
+    from foajax.runs.agents import TrainedAgent
 
     def make(agent, env_steps=0):
         random = np.random.default_rng(0)
         shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
         params = jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
-        return Stored(agent, params, agent.initial_statistics(), env_steps)
+        return TrainedAgent(agent, params, agent.initial_statistics(), env_steps)
 
     return make
 

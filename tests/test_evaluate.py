@@ -12,7 +12,7 @@ from foajax import cli, evaluate
 from foajax.config import shipped
 from foajax.config.compose import compose
 from foajax.learning.agent import Agent
-from foajax.runs.agents import Stored, load_agent
+from foajax.runs.agents import TrainedAgent, load_agent
 from foajax.viewing import games
 from foajax.viewing.games import Games, play
 
@@ -20,10 +20,10 @@ PONG = shipped.agents() / "pong-constant70_packed"
 
 
 @pytest.fixture(scope="module")
-def breakout() -> Stored:
+def breakout() -> TrainedAgent:
     """An agent that has not learned anything."""
     agent = Agent(compose(["experiment=constant50_sub2_packed", "network.dense=16", "network.lstm=16"]), 4, 34)
-    return Stored(agent, agent.initial_params(jax.random.key(0)), agent.initial_statistics(), env_steps=0)
+    return TrainedAgent(agent, agent.initial_params(jax.random.key(0)), agent.initial_statistics(), env_steps=0)
 
 
 def test_neighbouring_seeds_share_no_game(breakout):
@@ -73,7 +73,7 @@ def test_who_never_serves_is_cut(breakout):
     agent = Agent(compose([*words, "env.episodic_life=false", "env.max_episode_steps=700"]), 4, 34)
     params = jax.tree.map(np.copy, breakout.params)
     params["params"]["natural_policy"]["bias"] = np.array([9, 0, 0, 0], np.float32)  # waits
-    waiting = Stored(agent, params, breakout.statistics, env_steps=0)
+    waiting = TrainedAgent(agent, params, breakout.statistics, env_steps=0)
     played = play(waiting, episodes=2, num_envs=2, seed=0, greedy=True)
     assert isinstance(played, Games) and played.cut == 2 and played.lengths.tolist() == [700, 700]
 

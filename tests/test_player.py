@@ -11,7 +11,8 @@ import pytest
 from browser import browser_needed, opened_page
 
 from foajax import cli, player
-from foajax.sensors.reconstruct import packed, paint, tables
+from foajax.sensors.reconstruct import paint, tables
+from foajax.sensors.registry import make_sensor
 from foajax.viewing import player_page
 from foajax.viewing.recording import Screens
 
@@ -59,7 +60,7 @@ def test_the_player(recording, tmp_path):
 
 def pictures_are_what_was_recorded(page, recording):
     values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
-    painting = tables(packed(recording.config.sensor), recording.config.env.frame_shape)
+    painting = tables(make_sensor(recording.config.sensor).packed, recording.config.env.frame_shape)
     for step in (119, 0, 60, 59, 129):  # parts of 60 steps begin and end here
         go(page, step)
         screen = np.array(page.evaluate(PIXELS, "screen")).reshape(210, 160, 4)

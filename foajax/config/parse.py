@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
 
 ABSENT: Any = object()  # no value
+CODE = "package.module:Class"  # the kind of what is code from elsewhere
 
 
 class ConfigError(ValueError):
@@ -179,7 +180,7 @@ def resolve(node: Mapping[str, Any], root: Mapping[str, Any]) -> dict[str, Any]:
 def kinds(node: Mapping[str, Any], root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The sections that a key may hold, by their `kind`, where there are several."""
     sections = (resolve(each, root) for each in node.get("oneOf", ()))
-    return {each["properties"]["kind"]["const"]: each for each in sections}
+    return {each["properties"]["kind"].get("const", CODE): each for each in sections}
 
 
 def describe(node: Mapping[str, Any]) -> str:
@@ -195,7 +196,7 @@ def describe(node: Mapping[str, Any]) -> str:
             return f"[{', '.join(map(describe, node['prefixItems']))}]"
         case "array":
             return f"a list of {'at least one ' if node.get('minItems') else ''}{describe(node.get('items', {}))}"
-        case "object" if "additionalProperties" in node and "properties" not in node:
+        case "object" if isinstance(node.get("additionalProperties"), Mapping) and "properties" not in node:
             return f"a mapping to {describe(node['additionalProperties'])}"
         case "integer" | "number" as kind:
             return _describe_number(node, is_integer=kind == "integer")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from foajax.config.parse import Section, build, file_name, refuse
+from foajax.config.parse import CODE, Section, build, file_name, refuse
 
 # Words of before, which are still understood, and today's.
 RENAMED = {
@@ -35,6 +35,7 @@ Ring = Annotated[tuple[int, int, int], _says("[height, width, factor] with 1 <= 
 Grid = Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], _says("[rows, columns] >= 1")]
 Side = Annotated[int, Field(ge=8, le=10_000)]
 Shape = Annotated[tuple[Side, Side], _says("[height, width], each from 8 to 10000")]
+Width = Annotated[int, Field(ge=1, le=16_384)]
 Row = Annotated[int, Field(ge=0, le=50), _says("a screen row from 0 to 50 (160 rows are kept of 210)")]
 Name = Annotated[str, Field(pattern=r"\S"), _says("a name")]
 
@@ -43,6 +44,8 @@ class RingSensor(Section):
     """A focal area of nested rings; non-FoA, Constant, Decreasing and their (P) forms (Table II)."""
 
     prefix: ClassVar[str] = "sensor."
+    size_key: ClassVar[str] = "sensor.rings"  # what decides how large the focal area is
+    may_overhang: ClassVar[bool] = False  # whether the area may be larger than the frame where gaze.bounds=point
     rings: tuple[Ring, ...] = Field(min_length=1, description="Rings, inner to outer, with their subsampling factors.")
     kind: Literal["rings"] = Field("rings", description="Nested rings.")
     peripheral: Grid | None = Field(None, description="Grid of the coarse background; null for none.")
@@ -70,6 +73,8 @@ class LogPolarSensor(Section):
     """A log-polar retina: rings x wedges around the focal point, radii growing geometrically."""
 
     prefix: ClassVar[str] = "sensor."
+    size_key: ClassVar[str] = "sensor.radius"
+    may_overhang: ClassVar[bool] = True
     kind: Literal["logpolar"] = Field("logpolar", description="A log-polar retina.")
     rings: int = Field(35, ge=2, le=1000, description="How many rings there are.")
     wedges: int = Field(35, ge=4, le=1000, description="How many values each ring has.")
@@ -88,14 +93,24 @@ class LogPolarSensor(Section):
         return side, side
 
 
-Sensor = RingSensor | LogPolarSensor
+class OwnSensor(Section):
+    """A sensor from elsewhere; see `foajax.sensors.base.Sensor`. It is made, and checked, where it is first used."""
+
+    prefix: ClassVar[str] = "sensor."
+    size_key: ClassVar[str] = "sensor.kwargs"
+    may_overhang: ClassVar[bool] = True
+    window: ClassVar[None] = None  # not known before it is made
+    kind: str = Field(description="Its class, package.module:Class.")
+    kwargs: Mapping[str, Any] = Field({}, description="Arguments of its constructor.")
+
+
+SensorConfig = RingSensor | LogPolarSensor | OwnSensor
 
 
 def _kind(value: Any) -> str | None:
     """Which sensor a value is; rings where it is not said."""
-    if isinstance(value, Mapping):
-        return str(value.get("kind", "rings"))
-    return getattr(value, "kind", None)
+    kind = str(value.get("kind", "rings")) if isinstance(value, Mapping) else getattr(value, "kind", None)
+    return CODE if kind is not None and ":" in kind else kind
 
 
 class GazeConfig(Section):
@@ -144,6 +159,7 @@ class EnvConfig(Section):
     max_episode_steps: int = Field(27_000, ge=1, le=2_000_000, description="Agent steps after which a game is cut.")
     threads: int = Field(0, ge=0, le=1024, description="Threads of the engine; 0 lets it choose.")
     timeout: float = Field(120.0, gt=0, description="Seconds per step after which the engine is taken for hung.")
+    kwargs: Mapping[str, Any] = Field({}, description="Arguments of a Gymnasium environment or of one's own factory.")
 
     def check(self) -> None:
         if "default" not in self.crop_top:
@@ -154,7 +170,13 @@ class NetworkConfig(Section):
     """The network's parts and their sizes."""
 
     prefix: ClassVar[str] = "network."
-    torso: Literal["nature", "a3c"] = Field("nature", description="The convolutions.")
+    torso: str = Field("nature", description="The convolutions: nature, a3c, impala, or package.module:Class.")
+    widths: tuple[Width, ...] | None = Field(
+        None, min_length=1, description="Channels of the torso's layers; null for its own."
+    )
+    torso_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the torso.")
+    core: str = Field("lstm", description="The memory: lstm, gru, mingru, none (no memory), or package.module:Class.")
+    core_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the core.")
     dense: int = Field(256, ge=0, le=16_384, description="Units between torso and LSTM; 0 for none.")
     dense_norm: bool = Field(False, description="Layer norm of what enters these units.")
     lstm: int = Field(256, ge=1, le=16_384, description="Units of the LSTM.")
@@ -174,6 +196,11 @@ class NetworkConfig(Section):
     normalization: Literal["pixel", "running", "frame", "none"] = Field(
         "pixel", description="Frames less a mean: of each pixel, of all pixels so far, of one frame, or none."
     )
+
+    def check(self) -> None:
+        for key, ours in (("torso", ("nature", "a3c", "impala")), ("core", ("lstm", "gru", "mingru", "none"))):
+            if (name := getattr(self, key)) not in ours and ":" not in name:
+                raise refuse(key, name, (*ours, "package.module:Class"))
 
 
 class HeadConfig(Section):
@@ -271,9 +298,14 @@ class Config(Section):
 
     name: Name = Field(description="Name of the experiment, such as constant70.")
     sensor: Annotated[
-        Annotated[RingSensor, Tag("rings")] | Annotated[LogPolarSensor, Tag("logpolar")], Discriminator(_kind)
+        Annotated[RingSensor, Tag("rings")]
+        | Annotated[LogPolarSensor, Tag("logpolar")]
+        | Annotated[OwnSensor, Tag(CODE)],
+        Discriminator(_kind),
     ]
-    game: Name = Field("breakout", description="An Atari game, seek, probe:<name>, or gymnasium:<id>.")
+    game: Name = Field(
+        "breakout", description="An Atari game, seek, probe:<name>, gymnasium:<id>, or package.module:factory."
+    )
     seed: int = Field(0, ge=0, le=2**31 - 10_001, description="Seed of environments, parameters and actions.")
     run: str | None = Field(None, description="The run's directory; null for runs/<game>-<name>-s<seed>.")
     profile: bool = Field(False, description="Trace some updates into <run>/profile in place of training.")
@@ -294,16 +326,11 @@ class Config(Section):
         """The focal area, its grid and its points lie inside of the frame."""
         height, width = self.env.frame_shape
         frame = f"env.frame_shape={height}x{width}"
-        window, rings = self.sensor.window, isinstance(self.sensor, RingSensor)
-        key = "sensor.rings" if rings else "sensor.radius"
-        if (self.gaze.bounds == "window" or rings) and (window[0] > height or window[1] > width):
-            raise refuse(key, window, f"a focal area inside {frame}")
+        if self.sensor.window is not None:
+            check_window(self, self.sensor.window)
         grid = getattr(self.sensor, "peripheral", None) or (1, 1)
         if grid[0] > height or grid[1] > width:
             raise refuse("sensor.peripheral", grid, f"a grid no finer than {frame}")
-        if self.gaze.mode in ("learned", "random") and self.gaze.bounds == "window" and window == (height, width):
-            accepted = f"point, or gaze=none: {key} fills {frame} and could not move"
-            raise refuse("gaze.bounds", self.gaze.bounds, accepted)
         for y, x in self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ()):
             if not (0 <= y < height and 0 <= x < width):
                 raise refuse("gaze.start or gaze.path", (y, x), f"[y, x] inside {frame}")
@@ -324,9 +351,31 @@ class Config(Section):
             raise refuse("train.env_steps", self.train.env_steps, f"at most {most * rollout} with these {keys}")
 
     @property
+    def code(self) -> list[str]:
+        """What of it names code outside of foajax, which runs where the part is made."""
+        names = {"game": self.game, "sensor.kind": self.sensor.kind}
+        names |= {"network.torso": self.network.torso, "network.core": self.network.core}
+        ours = ("probe:", "gymnasium:ale_py:")
+        return [
+            f"{key}={name}"
+            for key, name in names.items()
+            if ":" in name.removeprefix("gymnasium:") and not name.startswith(ours)
+        ]
+
+    @property
     def run_dir(self) -> str:
         """Where the run's files are."""
         return self.run or f"runs/{file_name(self.game)}-{self.name}-s{self.seed}"
+
+
+def check_window(config: Config, window: tuple[int, int]) -> None:
+    """`ConfigError` unless the sensor's focal area fits into the frame and the gaze can move it."""
+    (height, width), key = config.env.frame_shape, config.sensor.size_key
+    frame, bounds = f"env.frame_shape={height}x{width}", config.gaze.bounds
+    if (bounds == "window" or not config.sensor.may_overhang) and (window[0] > height or window[1] > width):
+        raise refuse(key, window, f"a focal area inside {frame}")
+    if config.gaze.mode in ("learned", "random") and bounds == "window" and window == (height, width):
+        raise refuse("gaze.bounds", bounds, f"point, or gaze=none: {key} fills {frame} and could not move")
 
 
 def check_address(key: str, value: str) -> None:

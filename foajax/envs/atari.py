@@ -20,7 +20,12 @@ FRAME_SHAPE = (80, 80)  # of what `frames.crop_and_halve` makes of it
 
 def is_atari(config: Config) -> bool:
     """Whether an emulator plays the game."""
-    return config.game not in OWN and not config.game.startswith("gymnasium:")
+    return config.game not in OWN and not config.game.startswith("gymnasium:") and not is_own(config)
+
+
+def is_own(config: Config) -> bool:
+    """Whether it is made by code of the user's, `package.module:factory`."""
+    return ":" in config.game and not config.game.startswith(("gymnasium:", "probe:"))
 
 
 def atari_name(game: str, known: Iterable[str]) -> str:
@@ -34,7 +39,8 @@ def atari_name(game: str, known: Iterable[str]) -> str:
         return names[game]
     near = difflib.get_close_matches(game.lower(), [*names, *OWN], n=3)
     hint = f"; near: {', '.join(near)}" if near else ""
-    raise refuse("game", game, f"an Atari game (breakout), {', '.join(OWN)} or gymnasium:<id>{hint}")
+    others = f"{', '.join(OWN)}, gymnasium:<id> or package.module:factory"
+    raise refuse("game", game, f"an Atari game (breakout), {others}{hint}")
 
 
 def envpool_id(name: str) -> str:
@@ -44,6 +50,8 @@ def envpool_id(name: str) -> str:
 
 def check_game(config: Config) -> None:
     """`ConfigError` where there is no such Atari game, or `env` does not suit it; others show once they are made."""
+    if config.env.kwargs and not (is_own(config) or config.game.startswith("gymnasium:")):
+        raise refuse("env.kwargs", config.env.kwargs, f"{{}} for game={config.game}")
     if is_atari(config):
         atari_game(config)
 

@@ -1,7 +1,8 @@
 """Gymnasium's pixel environments as gray frames: `gymnasium:<id>`, the id as `gymnasium.make` takes it.
 
-Of `env` only `frame_shape`, `clip_rewards` and `max_episode_steps` apply; skipped frames, no-ops, lives and sticky
-actions are an emulator's. An id may name the module that registers it, e.g. `gymnasium:my_package:MyGame-v0`.
+Of `env` only `frame_shape`, `clip_rewards`, `max_episode_steps` and the constructor's `kwargs` apply; skipped frames,
+no-ops, lives and sticky actions are an emulator's. An id may name the module that registers it, e.g.
+`gymnasium:my_package:MyGame-v0`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class GymnasiumEnvironment:
         name = config.game.removeprefix("gymnasium:")
         if name.count(":") > 1 or name.startswith(":"):
             raise refuse("game", config.game, "gymnasium:<id> or gymnasium:<module>:<id>")
-        make = functools.partial(gymnasium.make, name, disable_env_checker=True)
+        make = functools.partial(gymnasium.make, name, disable_env_checker=True, **config.env.kwargs)
 
         def make_one() -> gymnasium.Env:
             env = make()

@@ -7,9 +7,11 @@ from typing import cast
 
 import numpy as np
 
+from foajax.config.parse import refuse
+from foajax.config.parts import make_part
 from foajax.config.schema import Config
 from foajax.envs.ale import AleEnvironment
-from foajax.envs.atari import atari_name, is_atari
+from foajax.envs.atari import atari_name, is_atari, is_own
 from foajax.envs.base import Environment
 from foajax.envs.envpool import EnvPoolEnvironment
 from foajax.envs.gymnasium import GymnasiumEnvironment
@@ -18,7 +20,8 @@ from foajax.envs.tasks import JaxEnvironment
 
 
 def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> Environment:
-    """The environment that plays `config.game`: an Atari game, `seek`, `probe:<name>` or `gymnasium:<id>`.
+    """The environment that plays `config.game`: an Atari game, `seek`, `probe:<name>`, `gymnasium:<id>` or
+    `package.module:factory`.
 
     Args:
       config: `game` and `env` are read.
@@ -29,6 +32,12 @@ def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> E
     Raises:
       ConfigError: if there is no such game, or the engine cannot do what `env` asks.
     """
+    if is_own(config):
+        arguments = {**config.env.kwargs, "num_envs": num_envs, "seed": seed}
+        made = make_part("game", config.game, {}, **arguments)
+        if not isinstance(made, Environment):
+            raise refuse("game", config.game, "what makes all of a foajax.envs.base.Environment")
+        return made
     if config.game in OWN:
         return JaxEnvironment(OWN[config.game](config.env.frame_shape), num_envs=num_envs, seed=seed)
     if config.game.startswith("gymnasium:"):

@@ -11,16 +11,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, UInt8
 
 from foajax.config.parse import refuse
-from foajax.config.schema import Config, RingSensor
+from foajax.config.schema import Config, check_window
 from foajax.learning.losses import log_prob
 from foajax.networks import network as networks
+from foajax.networks.cores import Carry
 from foajax.sensors import frames, gaze
-from foajax.sensors.sense import image_shapes, sense
+from foajax.sensors.base import Sensor
+from foajax.sensors.registry import make_sensor
+from foajax.sensors.sense import sense
 from foajax.types import (
     SCREEN_SHAPE,
     ActorOutput,
     ActorState,
-    CoreState,
     FrameStatistics,
     HostArray,
     NetworkOutput,
@@ -38,16 +40,28 @@ class Agent:
     num_actions: int  # natural actions of the game
     crop_top: int | None  # first screen row kept; None where screens are frames already
 
+    def __post_init__(self) -> None:
+        check_window(self.config, self.sensor.window)
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor that the configuration asks for."""
+        return make_sensor(self.config.sensor)
+
     @property
     def network(self) -> networks.Network:
         """The network, without its parameters."""
         return networks.make_network(self.config, self.num_actions)
 
+    @property
+    def image_shapes(self) -> tuple[tuple[int, int, int], ...]:
+        """Of what the sensor gives of a frame, (h, w, 1) each."""
+        return tuple((*shape, 1) for shape in self.sensor.image_shapes(self.config.env.frame_shape))
+
     def initial_params(self, key: PRNGKeyArray) -> Params:
         """Parameters before any learning."""
         side = self.side(jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2), jnp.int32), jnp.zeros(1), jnp.zeros(1, bool))
-        shapes = image_shapes(self.config.sensor, self.config.env.frame_shape)
-        return networks.initial_params(self.network, key, shapes, side.shape[-1])
+        return networks.initial_params(self.network, key, self.image_shapes, side.shape[-1])
 
     def initial_statistics(self) -> FrameStatistics:
         """Frame statistics before any frame."""
@@ -123,9 +137,9 @@ class Agent:
         side = self.side(steps.focal_point, steps.last_actions, steps.reward, steps.is_first)
         return self.forward(params, list(steps.roi), side, steps.is_first, rollout.core_state)[0]
 
-    def forward(self, params: Params, *inputs: Any) -> tuple[NetworkOutput, CoreState]:
+    def forward(self, params: Params, *inputs: Any) -> tuple[NetworkOutput, Carry]:
         """The network over T steps; `inputs` are those of `networks.Network`."""
-        return cast(tuple[NetworkOutput, CoreState], self.network.apply(params, *inputs))
+        return cast(tuple[NetworkOutput, Carry], self.network.apply(params, *inputs))
 
     def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W"]:
         """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
@@ -167,7 +181,7 @@ class Agent:
 
     def sense(self, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
         """The sensor's images of each frame, [B, h, w, 1]."""
-        look = functools.partial(sense, sensor=self.config.sensor, bounds=self.config.gaze.bounds)
+        look = functools.partial(sense, sensor=self.sensor, bounds=self.config.gaze.bounds)
         return jax.vmap(look)(frame, focal_point)
 
     def side(
@@ -204,9 +218,8 @@ class Agent:
     def _sees_focal_point(self) -> bool:
         # A packed image does not tell where it was taken. Nor does a canvas whose normalisation makes 0 of what never
         # changes, as of what is outside: between two rows of Breakout's empty middle it is the same.
-        sensor = self.config.sensor
-        canvas = isinstance(sensor, RingSensor) and sensor.layout == "canvas"
-        return not canvas or (self.config.network.focal_point == "always" and self.config.gaze.mode != "none")
+        config = self.config
+        return not self.sensor.in_place or (config.network.focal_point == "always" and config.gaze.mode != "none")
 
     @property
     def _by_pixel(self) -> bool:
@@ -215,7 +228,7 @@ class Agent:
     @property
     def _gaze(self) -> dict:
         config = self.config
-        return {"gaze": config.gaze, "window": config.sensor.window, "frame_shape": config.env.frame_shape}
+        return {"gaze": config.gaze, "window": self.sensor.window, "frame_shape": config.env.frame_shape}
 
 
 def _choose(key: Key[Array, "B"], logits: Float[Array, "B A"], greedy: bool) -> Int[Array, "B"]:

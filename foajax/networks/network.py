@@ -1,94 +1,23 @@
-"""The recurrent network with two heads: torso, LSTM, four outputs. The only file that imports flax."""
+"""The network with two heads: torso, core, four outputs."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from foajax.config.schema import Config, NetworkConfig
-from foajax.networks.convolution import convolve, max_pool
-from foajax.networks.lstm import lstm
-from foajax.types import CoreState, NetworkOutput, Params
-
-_RELU_GAIN = math.sqrt(2.0)  # keeps the variance through a ReLU (He et al. 2015)
-
-
-class Convolution(nn.Module):
-    """One convolution with a bias; the form is chosen by the backend."""
-
-    features: int
-    kernel: tuple[int, int]
-    stride: int = 1
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N h w D"]:
-        shape = (*self.kernel, x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.orthogonal(_RELU_GAIN), shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        return convolve(x, kernel, stride=self.stride) + bias.reshape(1, 1, 1, -1)
-
-
-class NatureTorso(nn.Module):
-    """Convolutions of Mnih et al. (2015): 32 8x8/4, 64 4x4/2, 64 3x3/1.
-
-    A packed image is already subsampled, so below 44 pixels the first layer halves its kernel and stride: a
-    unit then sees about the same patch of the frame as on the canvas. Layers that no longer fit are left out.
-    The strides fit the 84 pixels of that paper and leave out the last 4 rows and columns of 80, where Breakout has
-    its paddle. With `covers` nothing is left out: the first kernel grows by what its stride leaves, which costs little
-    there, and the maps of the others are padded with zeros.
-    """
-
-    covers: bool = True
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
-        first = (8, 4) if min(x.shape[1:3]) >= 44 else (4, 2)
-        for layer, (features, (kernel, stride)) in enumerate(((32, first), (64, (4, 2)), (64, (3, 1)))):
-            if min(x.shape[1:3]) < kernel:
-                continue
-            height = width = kernel
-            if self.covers and layer == 0:
-                height, width = (kernel + (size - kernel) % stride for size in x.shape[1:3])
-            elif self.covers:
-                bottom, right = (-(size - kernel) % stride for size in x.shape[1:3])
-                x = jnp.pad(x, ((0, 0), (0, bottom), (0, right), (0, 0)))
-            x = nn.relu(Convolution(features, (height, width), stride)(x))
-        return x.reshape(x.shape[0], -1)
-
-
-class A3CTorso(nn.Module):
-    """Four times 'convolution, 2x2 max-pool, ReLU': 32 5x5, 32 5x5, 64 4x4, 64 3x3, as public A3C code does.
-
-    Maps of 4x4 and less are not pooled further, which on an 80x80 canvas changes nothing.
-    """
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
-        for features, kernel, border in ((32, 5, 2), (32, 5, 1), (64, 4, 1), (64, 3, 1)):
-            x = jnp.pad(x, ((0, 0), (border, border), (border, border), (0, 0)))
-            x = Convolution(features, (kernel, kernel))(x)
-            x = nn.relu(max_pool(x) if min(x.shape[1:3]) > 4 else x)
-        return x.reshape(x.shape[0], -1)
-
-
-def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
-    """The torso of one image."""
-    if config.torso == "a3c":
-        return A3CTorso(name=name)
-    return NatureTorso(covers=config.padding == "cover", name=name)
-
+from foajax.networks.cores import LSTM, Carry, make_core
+from foajax.networks.torsos import RELU_GAIN, make_torso
+from foajax.types import NetworkOutput, Params
 
 _SMALLEST_IMAGE = 8  # below it (a 5x5 periphery) the values go straight to the next layer
 
 
 class Network(nn.Module):
-    """Torso on every image of the sensor, dense layer, LSTM, natural head and, where gaze is learned, vision head.
+    """Torso on every image of the sensor, dense layer, core, natural head and, where gaze is learned, vision head.
 
     The torso sees all T*B images at once, outside of any loop: convolution gradients inside a loop are slow.
     """
@@ -97,30 +26,24 @@ class Network(nn.Module):
     num_natural_actions: int
     num_vision_actions: int  # 0: no vision head (non-FoA, and gaze that is not learned)
 
+    def setup(self) -> None:
+        self.core = make_core(self.config)
+        if isinstance(self.core, LSTM):
+            nn.share_scope(self, self.core)  # agents on disk have its parameters beside the network's own
+
     @nn.compact
     def __call__(
         self,
         roi: Sequence[Float[Array, "T B _ _ _"]],
         side: Float[Array, "T B S"],
         is_first: Bool[Array, "T B"],
-        core_state: CoreState,
-    ) -> tuple[NetworkOutput, CoreState]:
-        """`side` is what the LSTM is told beside the images, S numbers or none. Each output is [T, B, ...]."""
+        core_state: Carry,
+    ) -> tuple[NetworkOutput, Carry]:
+        """`side` is what the core is told beside the images, S numbers or none. Each output is [T, B, ...]."""
         steps, batch = is_first.shape
         features = self.features([image.reshape(steps * batch, *image.shape[2:]) for image in roi])
-        features = jnp.concatenate([features, side.reshape(steps * batch, -1)], axis=-1)
-        width, norm = self.config.lstm, self.config.lstm_norm
-        projected = nn.Dense(
-            4 * width,
-            kernel_init=nn.initializers.orthogonal(1.0),
-            bias_init=nn.initializers.zeros if norm else self.gate_biases,
-            name="lstm_input",
-        )(features)
-        if norm:
-            # Ba et al. (2016). Without it a long training drives the gates to 0 and 1, and the score stands still.
-            projected = nn.LayerNorm(bias_init=self.gate_biases, name="lstm_norm")(projected)
-        recurrent = self.param("lstm_recurrent", _gate_orthogonal, (width, 4 * width))
-        hidden, core_state = lstm(projected.reshape(steps, batch, 4 * width), recurrent, is_first, core_state)
+        features = jnp.concatenate([features, side.reshape(steps * batch, side.shape[-1])], axis=-1)
+        hidden, core_state = self.core(features.reshape(steps, batch, -1), is_first, core_state)
         natural_logits, natural_value = self.head("natural", hidden, self.num_natural_actions)
         vision_logits, vision_value = None, None
         if self.num_vision_actions:
@@ -145,27 +68,15 @@ class Network(nn.Module):
         if self.config.dense_norm:
             features = nn.LayerNorm(use_bias=False, use_scale=False, name="dense_norm")(features)
         if self.config.dense:
-            dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(_RELU_GAIN), name="dense")
+            dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(RELU_GAIN), name="dense")
             features = nn.relu(dense(features))
         return features
-
-    def gate_biases(self, key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Float[Array, "G"]:
-        """Before learning, 0 but for the forget gates', so that memory lasts some steps (Jozefowicz et al. 2015)."""
-        biases = jnp.array([0.0, self.config.forget_bias, 0.0, 0.0], dtype)
-        return jnp.repeat(biases, shape[0] // 4)
 
     def head(self, name: str, hidden: Float[Array, "T B L"], actions: int) -> tuple[Array, Array]:
         """Softmax logits and value. Small first logits: every action is about equally likely at the start."""
         logits = nn.Dense(actions, kernel_init=nn.initializers.orthogonal(0.01), name=f"{name}_policy")(hidden)
         value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name=f"{name}_value")(hidden)
         return logits, value[..., 0]
-
-
-def _gate_orthogonal(key: Array, shape: tuple[int, int]) -> Array:
-    """Each gate's recurrent matrix is orthogonal of its own."""
-    width = shape[0]
-    make = nn.initializers.orthogonal(1.0)
-    return jnp.concatenate([make(k, (width, width)) for k in jax.random.split(key, 4)], axis=-1)
 
 
 def make_network(config: Config, num_natural_actions: int) -> Network:
@@ -184,7 +95,6 @@ def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[in
     return network.init(key, roi, jnp.zeros((1, 1, side)), jnp.zeros((1, 1), bool), core_state)
 
 
-def initial_core_state(network: Network, batch: int) -> CoreState:
-    """Zeros, [B, L]."""
-    zeros = jnp.zeros((batch, network.config.lstm))
-    return CoreState(cell=zeros, hidden=zeros)
+def initial_core_state(network: Network, batch: int) -> Carry:
+    """Before the first step of `batch` environments."""
+    return make_core(network.config).initial_state(batch)

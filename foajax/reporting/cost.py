@@ -17,9 +17,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from foajax.config.compose import compose
 from foajax.config.schema import Config
 from foajax.learning.agent import Agent
-from foajax.networks.network import make_torso
-from foajax.sensors.sense import pixel_count
-from foajax.types import CoreState, Params
+from foajax.networks.cores import Carry
+from foajax.networks.torsos import make_torso
+from foajax.types import Params
 
 BATCHES = (1, 32)
 _NUM_ACTIONS = 4  # Breakout's
@@ -70,9 +70,9 @@ def decide(
     params: Params,
     roi: tuple[Float[Array, "B _ _ 1"], ...],
     focal_point: Int[Array, "B 2"],
-    core_state: CoreState,
+    core_state: Carry,
     key: PRNGKeyArray,
-) -> tuple[Array, Array, CoreState]:
+) -> tuple[Array, Array, Carry]:
     """The network's part: torso to sampling, and the gaze's move."""
     batch = focal_point.shape[0]
     natural_key, vision_key = jax.random.split(key, (2, batch))
@@ -91,9 +91,9 @@ def decision(
     params: Params,
     frame: Float[Array, "B H W"],
     focal_point: Int[Array, "B 2"],
-    core_state: CoreState,
+    core_state: Carry,
     key: PRNGKeyArray,
-) -> tuple[Array, Array, CoreState]:
+) -> tuple[Array, Array, Carry]:
     """Both parts as one program."""
     return decide(agent, params, sense(agent, frame, focal_point), focal_point, core_state, key)
 
@@ -129,7 +129,7 @@ def _count(agent: Agent, params: Params) -> dict[str, Any]:
     config = agent.config
     frame, focal_point, core_state, key = _inputs(agent, 1)
     roi = jax.eval_shape(functools.partial(sense, agent), frame, focal_point)
-    count = pixel_count(config.sensor, config.env.frame_shape)
+    count = agent.sensor.count(config.env.frame_shape)
     return {
         "experiment": config.name,
         "torso": config.network.torso,
@@ -142,7 +142,7 @@ def _count(agent: Agent, params: Params) -> dict[str, Any]:
     }
 
 
-def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, CoreState, Array]:
+def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, Carry, Array]:
     """A batch of frames of noise, the focal points at their centres."""
     shape = agent.config.env.frame_shape
     frame = jnp.asarray(np.random.default_rng(0).normal(size=(batch, *shape)), jnp.float32)

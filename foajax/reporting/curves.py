@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.reporting.scores import CONFIDENCE, RESAMPLES, Interval
+from foajax.runs.agents import check_trust
 from foajax.runs.directory import load_config
 from foajax.runs.rows import parse_row
 from foajax.viewing.style import STYLE
@@ -50,14 +51,15 @@ class Band(NamedTuple):
     high: Float[np.ndarray, "m"]
 
 
-def read_run(path: str | Path) -> RunData:
+def read_run(path: str | Path, *, trust: bool = False) -> RunData:
     """Reads a run's directory.
 
     Raises:
-      ConfigError: it is none, or no game has ended in it yet.
+      ConfigError: it is none, no game has ended in it yet, or it names code and `trust` is not given.
     """
     path = Path(path)
     config = load_config(path)
+    check_trust(path, config, trust)
     file = path / "metrics.jsonl"
     try:
         rows = [row for line in file.read_bytes().splitlines() if (row := parse_row(line, "score"))]

@@ -15,7 +15,7 @@ from foajax.config.parse import refuse, replace, to_mapping
 from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
 from foajax.reporting.groups import games_of
 from foajax.runs.status import newest_checkpoint
-from foajax.sensors.sense import pixel_count
+from foajax.sensors.registry import make_sensor
 
 KEPT = shipped.kept_runs()
 _ROWS = 500
@@ -65,7 +65,7 @@ def _facts(run: RunData, newest: int) -> dict[str, Any]:
 def row(run: RunData) -> list[str]:
     """A line of the table."""
     facts, score = json.loads((run.path / "run.json").read_text()), run.evaluation or {}
-    values = pixel_count(run.config.sensor, run.config.env.frame_shape).nominal
+    values = make_sensor(run.config.sensor).count(run.config.env.frame_shape).nominal
     return [
         run.config.game,
         f"`{run.config.name}`",

@@ -208,7 +208,7 @@ def _stored_map(run: RunData) -> HeatMap | None:
 def _make_map(run: RunData, episodes: int) -> HeatMap | None:
     """Of games played now; None where the run has nothing that could play."""
     try:
-        stored = load_agent(run.path)
+        stored = load_agent(run.path, trust=True)  # as `read_run` was told
         with progress_bar() as bar:
             games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
             heat = heatmap.heat_map([game._replace(images=()) for game in games])

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from foajax.config.parse import refuse
 from foajax.config.schema import Config, GazeConfig
+from foajax.sensors.registry import make_sensor
 
 Shape = tuple[int, int]  # rows, columns
 
@@ -116,4 +117,4 @@ def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[n
 
 def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
     """The smallest and the largest focal point (y, x)."""
-    return limits(gaze=config.gaze, window=config.sensor.window, frame_shape=config.env.frame_shape)
+    return limits(gaze=config.gaze, window=make_sensor(config.sensor).window, frame_shape=config.env.frame_shape)

@@ -18,11 +18,40 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Num
 
 from foajax.config.schema import LogPolarSensor
+from foajax.sensors.base import Sensor
+from foajax.sensors.window import Shape, look, place
 
 _SAMPLES = 32  # sample points along each side of a cell, to measure how much of it lies in a pixel
+
+
+class LogPolar(Sensor):
+    """The retina as a sensor: one image [rings, wedges]."""
+
+    is_round = True
+
+    def __init__(self, config: LogPolarSensor) -> None:
+        self.config, self.window = config, config.window
+
+    def sense(self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str) -> tuple[Array, ...]:
+        """The cells around the focal point."""
+        return look(frame, focal_point, bounds, size=self.window, pool=self._pool)
+
+    def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
+        """Rings and wedges, whatever the frame."""
+        return ((self.config.rings, self.config.wedges),)
+
+    def picture(
+        self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
+    ) -> Float[Array, "H W"]:
+        """The image warped back."""
+        window = unwarp(images[0], sensor=self.config)
+        return place(window, focal_point - np.array(self.window) // 2, frame_shape)
+
+    def _pool(self, window: Num[Array, "h w"]) -> tuple[Float[Array, "_ _"], ...]:
+        return (warp(window.astype(jnp.float32), sensor=self.config),)
 
 
 def warp(window: Float[Array, "side side"], *, sensor: LogPolarSensor) -> Float[Array, "rings wedges"]:

@@ -1,8 +1,9 @@
-"""Nested areas of blocks, and the coarse grid around them: the geometry of a `RingSensor`."""
+"""Nested areas of blocks, and the coarse grid around them: the sensor of the paper (Table II)."""
 
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,9 +11,115 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.config.parse import refuse
+from foajax.config.parse import refuse, replace
 from foajax.config.schema import RingSensor
-from foajax.sensors.window import Shape, place
+from foajax.sensors.base import PixelCount, Sensor
+from foajax.sensors.window import Shape, look, place
+
+
+class Rings(Sensor):
+    """Nested areas pooled in blocks (the RoI layers of the paper, Table II).
+
+    The blocks of a ring are aligned to its own top-left corner; where they do not divide it, the last
+    ones are smaller. A block's value is its mean, zeros outside the frame included ('mean'), or its
+    top-left pixel ('stride'). A finer ring hides what lies under it; a block that it covers in part
+    is pooled whole and shown where it is not covered. The peripheral grid is the whole frame, cut
+    at rows i * H // rows and columns likewise, pooled and hidden by the focal area in the same way.
+
+    - layout 'canvas': one image of the frame's size, each value painted over the pixels that it
+      stands for.
+    - layout 'packed': one image a ring, one value a block, then the grid; hidden ones are 0. The
+      canvas's values, each once.
+    """
+
+    def __init__(self, config: RingSensor) -> None:
+        self.config, self.window = config, config.window
+
+    def sense(
+        self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str
+    ) -> tuple[Float[Array, "_ _"], ...]:
+        """The canvas, or the rings' images and the grid's."""
+        config, shape = self.config, (frame.shape[0], frame.shape[1])
+        parts = look(frame, focal_point, bounds, size=self.window, pool=self._pool)
+        cells = None if config.peripheral is None else sense_cells(frame, config)
+        corner = focal_point - np.array(self.window) // 2
+        if self.in_place:
+            return (canvas(parts, cells, corner, config, shape),)
+        hidden = hidden_blocks(config)
+        images = [parts[0], *(jnp.where(h, 0.0, part) for h, part in zip(hidden, parts[1:], strict=True))]
+        if cells is not None:
+            edges = cell_edges(config, shape)
+            rows, columns = (covered(edges[axis], corner[axis], self.window[axis]) for axis in (0, 1))
+            images.append(jnp.where(rows[:, None] & columns[None], 0.0, cells))
+        return tuple(images)
+
+    def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
+        """The frame's, or the rings' in blocks and the grid's."""
+        if self.in_place:
+            return (frame_shape,)
+        shapes = [(-(-height // factor), -(-width // factor)) for height, width, factor in self.config.rings]
+        return (*shapes, self.config.peripheral) if self.config.peripheral else tuple(shapes)
+
+    def picture(
+        self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
+    ) -> Float[Array, "H W"]:
+        """The canvas, of either layout."""
+        if self.in_place:
+            return images[0]
+        corner, number = focal_point - np.array(self.window) // 2, len(self.config.rings)
+        cells = images[number] if self.config.peripheral else None
+        return canvas(images[:number], cells, corner, self.config, frame_shape)
+
+    def count(self, frame_shape: Shape) -> PixelCount:
+        """The pixel budget as Table II counts it, and what is really shown.
+
+        Nominal: each ring's area less that of the next finer one, over its factor squared, rounded; a
+        peripheral grid adds the largest number of cells that an area inside the frame leaves visible
+        (16 for 70x70 in 5x5). Actual differs where blocks do not divide an area (70 by 4) or straddle
+        a finer ring.
+        """
+        config, nominal, inner = self.config, 0.0, 0
+        for height, width, factor in config.rings:
+            nominal += (height * width - inner) / factor**2
+            inner = height * width
+        actual = sum(math.prod(shape) for shape in self.packed.image_shapes(frame_shape))
+        actual -= sum(int(hidden.sum()) for hidden in hidden_blocks(config))
+        if config.peripheral is not None:
+            least = centred = 1  # cells hidden along one axis, times those along the other
+            for edges, size, length in zip(cell_edges(config, frame_shape), frame_shape, self.window, strict=True):
+                hidden = [int(covered(edges, first, length).sum()) for first in range(size - length + 1)]
+                least, centred = least * min(hidden), centred * hidden[size // 2 - length // 2]
+            nominal, actual = nominal + math.prod(config.peripheral) - least, actual - centred
+        return PixelCount(round(nominal), actual)
+
+    @functools.cached_property
+    def packed(self) -> Rings:
+        """The same rings in the packed layout."""
+        return Rings(replace(self.config, layout="packed")) if self.in_place else self
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the layout is a canvas."""
+        return self.config.layout == "canvas"
+
+    @property
+    def areas(self) -> tuple[Shape, ...]:
+        """Of each ring."""
+        return tuple(ring[:2] for ring in self.config.rings)
+
+    def _pool(self, window: Num[Array, "h w"]) -> tuple[Float[Array, "_ _"], ...]:
+        """The mean of each block, ring by ring, nothing hidden yet; or its first pixel."""
+        parts, window = [], window.astype(jnp.float32)
+        for (height, width, factor), (top, left) in zip(self.config.rings, offsets(self.config), strict=True):
+            area = window[top : top + height, left : left + width]
+            if self.config.pooling == "stride" or factor == 1:
+                parts.append(area[::factor, ::factor])
+                continue
+            # Rows first: they are added up whole before anything is picked apart.
+            sums = block_sums(block_sums(area, factor, 0), factor, 1)
+            rows, columns = (np.diff(block_edges(size, factor)) for size in (height, width))
+            parts.append(sums / np.outer(rows, columns).astype(np.float32))
+        return tuple(parts)
 
 
 def block_sums(x: Float[Array, "_ _"], factor: int, axis: int) -> Float[Array, "_ _"]:

@@ -26,10 +26,13 @@ from jaxtyping import Array, Bool, Float, Int, Num, UInt32
 
 from foajax.config.compose import compose
 from foajax.config.parse import refuse, replace
-from foajax.config.schema import Config, EnvConfig, GazeConfig, Sensor
+from foajax.config.schema import Config, EnvConfig, GazeConfig, OwnSensor, SensorConfig, check_window
 from foajax.sensors import gaze as gazes
-from foajax.sensors.sense import image_shapes, sense
+from foajax.sensors.base import Sensor
+from foajax.sensors.registry import make_sensor
+from foajax.sensors.sense import sense
 
+AnySensor = SensorConfig | Sensor | str
 _SEEDS = 2**32
 
 
@@ -47,7 +50,7 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
         that is none or takes no visual actions.
     """
 
-    def __init__(self, env: gymnasium.Env, sensor: Sensor | str, gaze: GazeConfig | None = None) -> None:
+    def __init__(self, env: gymnasium.Env, sensor: AnySensor, gaze: GazeConfig | None = None) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(self, sensor=sensor, gaze=gaze)
         gymnasium.Wrapper.__init__(self, env)
         self._eye = _Eye.of(env.observation_space, sensor, gaze)
@@ -102,7 +105,7 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
       ConfigError: as in `FoveatedObservation`, or episodes that restart on the step that ends them.
     """
 
-    def __init__(self, env: gymnasium.vector.VectorEnv, sensor: Sensor | str, gaze: GazeConfig | None = None) -> None:
+    def __init__(self, env: gymnasium.vector.VectorEnv, sensor: AnySensor, gaze: GazeConfig | None = None) -> None:
         super().__init__(env)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
@@ -157,14 +160,14 @@ class _Eye:
     gaze: GazeConfig
 
     @classmethod
-    def of(cls, space: gymnasium.Space, sensor: Sensor | str, gaze: GazeConfig | None) -> _Eye:
+    def of(cls, space: gymnasium.Space, sensor: AnySensor, gaze: GazeConfig | None) -> _Eye:
         """Checks that the parts fit each other."""
         box = _pixels(space)
         if isinstance(sensor, str):
             experiment = compose([f"experiment={sensor}"])
             sensor, gaze = experiment.sensor, gaze or replace(experiment.gaze, mode="learned")
         gaze = gaze or GazeConfig()
-        if not isinstance(sensor, Sensor):
+        if not isinstance(sensor, SensorConfig | Sensor):
             raise refuse("sensor", sensor, "a RingSensor, a LogPolarSensor or an experiment's name")
         if not isinstance(gaze, GazeConfig):
             raise refuse("gaze", gaze, "a GazeConfig")
@@ -173,15 +176,18 @@ class _Eye:
         # What a run is checked for, a wrapped environment is checked for too. But the whole frame may be a baseline
         # here, which a gaze that has to move is refused.
         still = replace(gaze, mode="frozen")
-        Config(name="wrapper", sensor=sensor, gaze=still, env=EnvConfig(frame_shape=(box.shape[0], box.shape[1])))
-        return cls(box=box, sensor=sensor, gaze=gaze)
+        env = EnvConfig(frame_shape=(box.shape[0], box.shape[1]))
+        known = sensor if isinstance(sensor, SensorConfig) else OwnSensor(kind=type(sensor).__name__)
+        made = make_sensor(sensor)
+        check_window(Config(name="wrapper", sensor=known, gaze=still, env=env), made.window)
+        return cls(box=box, sensor=made, gaze=gaze)
 
     @property
     def observation_space(self) -> gymnasium.Space:
         """Of one environment."""
         low, high = self.range
         height, width, *channels = self.box.shape
-        shapes = [(h, w, *(channels or [1])) for h, w, _ in image_shapes(self.sensor, (height, width))]
+        shapes = [(h, w, *(channels or [1])) for h, w in self.sensor.image_shapes((height, width))]
         images = self.named([spaces.Box(low, high, shape, np.float32) for shape in shapes])
         return spaces.Dict({**images, "focal_point": spaces.Box(-1.0, 1.0, (2,), np.float32)})
 

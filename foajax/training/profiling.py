@@ -77,7 +77,7 @@ def profile(config: Config, environments: list[Environment], directory: str) -> 
 def flops_a_step(agent: Agent) -> dict[str, float]:
     """Floating-point operations of `act` and of `update` (without the optimiser) for one step, as XLA counts them.
 
-    Counted on few images, for which the plain convolution is used: XLA counts the body of a loop only once.
+    Counted on few images and scaled up.
     """
     shape = agent.config.env.frame_shape if agent.crop_top is None else SCREEN_SHAPE
     false = np.zeros(1, bool)

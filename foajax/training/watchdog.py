@@ -29,7 +29,7 @@ import jax
 
 from foajax.config.parse import ConfigError, one_line
 from foajax.config.schema import Config
-from foajax.launch.signals import signal_in
+from foajax.launch.signals import arrive_here, signal_in
 from foajax.runs.agents import CHECKPOINTS
 from foajax.runs.checkpoints import Checkpoints
 
@@ -51,7 +51,7 @@ class Call(NamedTuple):
 
 
 class Watchdog:
-    """Watches until it is closed. Belongs to the main thread, where signals arrive.
+    """Watches until it is closed. It hears of signals where it belongs to the main thread.
 
     Args:
       timeout: seconds that one call of an environment may take. Only seconds in which this process runs count:
@@ -79,14 +79,16 @@ class Watchdog:
         self._closed = False
         self._hear, self._wake = os.pipe()
         os.set_blocking(self._wake, False)
-        self._former = signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
+        self._hears = arrive_here()
+        self._former = signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False) if self._hears else -1
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Ends the watch."""
         self._closed = True
-        signal.set_wakeup_fd(self._former)
+        if self._hears:
+            signal.set_wakeup_fd(self._former)
         os.write(self._wake, b"\0")
         self._thread.join()
         os.close(self._hear)

@@ -12,7 +12,7 @@ import numpy as np
 from foajax.config.parse import refuse
 from foajax.envs.base import Environment
 from foajax.envs.make import make
-from foajax.runs.agents import Stored
+from foajax.runs.agents import TrainedAgent
 
 _SEEDS = 2**31  # seeds to choose from
 _WATCHED = 1_000_003  # keeps what `np.random.SeedSequence` makes of them apart from the seeds of training
@@ -26,7 +26,7 @@ class Games(NamedTuple):
     cut: int  # how many of them reached `env.max_episode_steps`
 
 
-def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = False) -> Environment:
+def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool = False) -> Environment:
     """What an agent is watched in: the game that it was trained in, with seeds apart from those of training.
 
     Raises:
@@ -45,7 +45,7 @@ def environment(stored: Stored, *, num_envs: int, seed: int, render: bool = Fals
 
 
 def play(
-    stored: Stored,
+    stored: TrainedAgent,
     *,
     episodes: int,
     num_envs: int,

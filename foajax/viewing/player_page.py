@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from foajax.config.schema import LogPolarSensor
 from foajax.envs.make import steps_per_second
 from foajax.runs import durable
 from foajax.sensors.gaze import NAMES
-from foajax.sensors.reconstruct import packed, tables
-from foajax.sensors.sense import ring_boxes
+from foajax.sensors.reconstruct import tables
+from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
 
 PAGE = "index.html"
@@ -44,7 +43,7 @@ def write_page(recording: Recording, directory: Path) -> Path:
 
 def encode(recording: Recording) -> dict[str, Any]:
     """All of a recording, as the page's script reads it."""
-    config, sensor = recording.config, packed(recording.config.sensor)
+    config, sensor = recording.config, make_sensor(recording.config.sensor).packed
     palette, screens = _screens(recording)
     values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
     painting = tables(sensor, config.env.frame_shape)
@@ -59,8 +58,8 @@ def encode(recording: Recording) -> dict[str, Any]:
         "screen_shape": shape,
         "frame_shape": config.env.frame_shape,
         "origin": [origin[0] * scale[0], origin[1] * scale[0], origin[2] * scale[1]],
-        "areas": [box[2:] for box in ring_boxes((0, 0), sensor)],
-        "round": isinstance(sensor, LogPolarSensor),
+        "areas": sensor.areas,
+        "round": sensor.is_round,
         "gaze": config.gaze.mode,
         "natural_names": recording.actions,
         "vision_names": NAMES[: config.gaze.actions],

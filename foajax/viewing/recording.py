@@ -18,8 +18,7 @@ from foajax.envs.atari import is_atari
 from foajax.envs.base import Environment
 from foajax.envs.make import action_names
 from foajax.learning.agent import Agent
-from foajax.runs.agents import Stored
-from foajax.sensors.reconstruct import packed
+from foajax.runs.agents import TrainedAgent
 from foajax.sensors.sense import sense
 from foajax.types import ActorOutput, ActorState, FrameStatistics, NetworkOutput, Params, TimeStep
 from foajax.viewing import games
@@ -101,7 +100,7 @@ class _Row(NamedTuple):
 
 
 def record(
-    stored: Stored,
+    stored: TrainedAgent,
     *,
     episodes: int = 1,
     seed: int = 0,
@@ -144,7 +143,7 @@ def record(
 
 def _play(
     environment: Environment,
-    stored: Stored,
+    stored: TrainedAgent,
     decide: Callable[..., tuple[_Row, Array, ActorState]],
     key: PRNGKeyArray,
     max_steps: int | None,
@@ -195,7 +194,7 @@ def _decide(
     """One decision, with the frame and what the packed sensor gives of it before normalisation."""
     output, network, state = agent.act(params, statistics, state, timestep, key, greedy=greedy)
     frame = agent.frame(timestep.frame)[0]
-    images = sense(frame, output.focal_point[0], sensor=packed(agent.config.sensor))
+    images = sense(frame, output.focal_point[0], sensor=agent.sensor.packed)
     levels = [jnp.round(255 * image[..., 0]).astype(jnp.uint8) for image in images]
     return _Row(output._replace(roi=(), frames=()), network, levels), frame, state
 
@@ -235,7 +234,7 @@ def _gray(screen: np.ndarray) -> np.ndarray:
     return np.repeat(screen[..., None], 3, axis=-1)
 
 
-def play(stored: Stored, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
+def play(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
     """`record`, with a bar for each game while it is played."""
 
     def progress(steps: int, score: float) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from foajax.sensors.gaze import NAMES
-from foajax.sensors.reconstruct import packed, paint, tables
+from foajax.sensors.reconstruct import paint, tables
+from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
 from foajax.viewing.style import NATURAL, VISION, draw_gaze
 
@@ -30,7 +31,7 @@ class Scene:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._sensor = packed(recording.config.sensor)
+        self._sensor = make_sensor(recording.config.sensor).packed
         self._painting = tables(self._sensor, recording.config.env.frame_shape)
         self._values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
         self._white = max(int(self._values.max()), 1)  # of the whole game, so that nothing flickers
@@ -83,8 +84,7 @@ class Scene:
         screen = _enlarge(Image.fromarray(recording.screens[step]), scale)
         top, down, across = recording.frame_origin
         point = (int(recording.focal_point[step][0]), int(recording.focal_point[step][1]))
-        sensor = recording.config.sensor
-        draw_gaze(screen, sensor, point, scale=(scale * down, scale * across), top=scale * top, halo=True)
+        draw_gaze(screen, self._sensor, point, scale=(scale * down, scale * across), top=scale * top, halo=True)
         image.paste(screen, (_MARGIN, _TOP))
 
     def _draw_view(self, image: Image.Image, step: int) -> None:

@@ -12,9 +12,8 @@ from jaxtyping import Array, Float, Int
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from foajax.config.parse import refuse
-from foajax.config.schema import RingSensor, Sensor
-from foajax.sensors.reconstruct import picture
-from foajax.sensors.sense import pixel_count, sense
+from foajax.sensors.base import Sensor
+from foajax.sensors.sense import picture, sense
 from foajax.viewing.style import draw_gaze
 
 PAPER = (
@@ -69,7 +68,7 @@ def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[P
         (f"frame, gaze at y {point[0]}, x {point[1]}", _marked(frame / white, sensor, point)),
         ("what the sensor shows", _grey(np.asarray(seen)[..., 0] / white)),
     ]
-    if isinstance(sensor, RingSensor) and sensor.layout == "canvas":
+    if sensor.in_place:
         return panels
     for i, image in enumerate(images):
         caption = f"image {i}: {image.shape[0]} x {image.shape[1]}"
@@ -118,7 +117,7 @@ def _row(panels: Sequence[Panel]) -> Image.Image:
 
 def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
     """The sensor's name, and its pixel budget as Table II counts it."""
-    count = pixel_count(sensor, frame.shape)
+    count = sensor.count((frame.shape[0], frame.shape[1]))
     shown = "" if count.actual == count.nominal else f" ({count.actual:,} shown)"
     return name, f"{count.nominal:,} values{shown}, {100 * count.nominal / frame.size:.0f}% of the frame"
 

@@ -6,8 +6,7 @@ from typing import Any
 
 from PIL import Image, ImageDraw
 
-from foajax.config.schema import LogPolarSensor, Sensor
-from foajax.sensors.sense import ring_boxes
+from foajax.sensors.base import Sensor, boxes
 
 RINGS = ("#ffb000", "#2fb8ff", "#ff5c9a")  # inner to outer, told apart by the colour-blind too
 NATURAL, VISION = "#58d68d", "#b794ff"  # the two heads
@@ -52,8 +51,8 @@ def draw_gaze(
     """
     pen = ImageDraw.Draw(image)
     down, across = scale
-    shape = pen.ellipse if isinstance(sensor, LogPolarSensor) else pen.rectangle
-    for i, (y, x, height, width) in reversed(list(enumerate(ring_boxes(point, sensor)))):
+    shape = pen.ellipse if sensor.is_round else pen.rectangle
+    for i, (y, x, height, width) in reversed(list(enumerate(boxes(sensor, point)))):
         left, upper = round(across * x), round(top + down * y)
         right, lower = round(across * (x + width)) - 1, round(top + down * (y + height)) - 1
         if halo:

@@ -12,8 +12,11 @@ from foajax.config.schema import LearnerConfig
 from foajax.learning.optimizer import make_optimizer
 
 UPDATES = 200
+RTOL = 1e-5  # Optax corrects the bias in float32, which loses some digits of 1 - 0.999
 SHAPES = {"dense": {"kernel": (5, 3), "bias": (3,)}, "scale": ()}
-PLAIN = LearnerConfig(learning_rate=0.01, full_rate_inputs=None, warmup_updates=0, amsgrad=True, max_grad_norm=None)
+PLAIN = LearnerConfig(
+    learning_rate=0.01, full_rate_inputs=None, warmup_updates=0, schedule="constant", amsgrad=True, max_grad_norm=None
+)
 
 
 def is_shape(x):
@@ -68,7 +71,7 @@ def test_every_update_is_pytorchs(amsgrad, eps, max_grad_norm, schedule):
     learner = replace(PLAIN, amsgrad=amsgrad, adam_eps=eps, max_grad_norm=max_grad_norm, schedule=schedule)
     actual, expected = list(run(learner, 150)), list(pytorch_rule(learner, 150))
     assert len(actual) == UPDATES
-    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * learner.learning_rate)
+    np.testing.assert_allclose(actual, expected, rtol=RTOL, atol=RTOL * learner.learning_rate)
     assert np.any(actual[150:]) == (schedule == "constant")
 
 
@@ -84,7 +87,7 @@ def test_other_decay_rates_and_no_jit():
     learner = replace(PLAIN, adam_b1=0.0, adam_b2=0.9, adam_eps=1e-3, max_grad_norm=0.05)
     actual = list(run(learner, 150, compiled=lambda f: f))
     expected = list(pytorch_rule(learner, 150))
-    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * learner.learning_rate)
+    np.testing.assert_allclose(actual, expected, rtol=RTOL, atol=RTOL * learner.learning_rate)
 
 
 @pytest.mark.parametrize("amsgrad", [True, False])
@@ -114,7 +117,7 @@ def test_first_update_by_hand():
     """After bias correction the moments are g and g^2: -lr g / (|g| + eps)."""
     learner = replace(PLAIN, learning_rate=0.5, adam_eps=1.0)
     updates, state = one_update(learner, {"w": jnp.array([3.0, -1.0, 0.0])})
-    np.testing.assert_allclose(updates["w"], [-0.375, 0.25, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(updates["w"], [-0.375, 0.25, 0.0], rtol=RTOL)
     np.testing.assert_allclose(state.mu["w"], [0.3, -0.1, 0.0], rtol=1e-6)
     np.testing.assert_allclose(state.nu["w"], [0.009, 0.001, 0.0], rtol=1e-6)
 

@@ -9,8 +9,8 @@ import pytest
 from foajax.config import compose
 from foajax.config.schema import NetworkConfig
 from foajax.learning.agent import Agent
-from foajax.networks.network import initial_core_state, make_torso
-from foajax.sensors.sense import image_shapes
+from foajax.networks.network import initial_core_state
+from foajax.networks.torsos import make_torso
 
 EXPERIMENTS = compose.list_experiments()
 
@@ -23,8 +23,7 @@ def build(*overrides):
 def inputs(agent, steps, batch):
     """Random images, what the LSTM is told beside them, and one episode that starts at step 2."""
     rng = np.random.default_rng(0)
-    shapes = image_shapes(agent.config.sensor, agent.config.env.frame_shape)
-    roi = [jnp.asarray(rng.normal(size=(steps, batch, *shape)), jnp.float32) for shape in shapes]
+    roi = [jnp.asarray(rng.normal(size=(steps, batch, *shape)), jnp.float32) for shape in agent.image_shapes]
     is_first = np.zeros((steps, batch), bool)
     is_first[2, 1] = True
     point, actions = rng.integers(30, 50, (steps, batch, 2)), rng.integers(0, 4, (steps, batch, 2))

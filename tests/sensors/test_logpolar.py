@@ -12,8 +12,9 @@ import pytest
 
 from foajax.config.schema import LogPolarSensor
 from foajax.sensors import logpolar
-from foajax.sensors.reconstruct import picture
-from foajax.sensors.sense import ring_boxes, sense
+from foajax.sensors.base import boxes
+from foajax.sensors.registry import make_sensor
+from foajax.sensors.sense import picture, sense
 
 SENSORS = {
     f"{name}-{sampling}": LogPolarSensor(**fields, sampling=sampling)
@@ -58,7 +59,7 @@ def cell_at(sensor, dy, dx):
 def test_the_geometry_by_hand():
     sensor = LogPolarSensor(rings=4, wedges=8, fovea=1.0, radius=8.0)
     np.testing.assert_allclose(logpolar.ring_edges(sensor), [0, 1, 2, 4, 8])
-    assert ring_boxes((40, 40), sensor) == [(32, 32, 16, 16)]
+    assert boxes(make_sensor(sensor), (40, 40)) == [(32, 32, 16, 16)]
     # One bright pixel, its centre at (0.5, 3.5) right of the focal point: the third ring's first wedge,
     # which begins at the x axis and turns downwards.
     frames = np.zeros((2, 80, 80), np.float32)

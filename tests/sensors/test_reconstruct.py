@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from foajax.config.schema import LogPolarSensor, RingSensor
-from foajax.sensors.reconstruct import packed, paint, picture, tables
-from foajax.sensors.sense import sense
+from foajax.sensors.reconstruct import paint, tables
+from foajax.sensors.registry import make_sensor
+from foajax.sensors.sense import picture, sense
 
 SENSORS = {
     "rings": RingSensor(rings=((10, 12, 1), (20, 20, 2), (30, 28, 4)), peripheral=(5, 5)),
@@ -21,7 +22,7 @@ SHAPE = (40, 36)
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_painting_is_the_picture(name):
-    sensor = packed(SENSORS[name])
+    sensor = make_sensor(SENSORS[name]).packed
     painting = tables(sensor, SHAPE)
     levels = np.random.default_rng(0).integers(1, 256, SHAPE)
     for point in ((20, 18), (0, 0), (39, 35), (7, 30)):
@@ -34,7 +35,7 @@ def test_a_painting_is_the_picture(name):
 
 
 def test_a_canvas_is_packed_and_a_retina_is_left_alone():
-    canvas = SENSORS["rings"]
-    assert canvas.layout == "canvas" and packed(canvas).layout == "packed"
-    assert packed(canvas).rings == canvas.rings
-    assert packed(SENSORS["retina"]) == SENSORS["retina"]
+    canvas, retina = make_sensor(SENSORS["rings"]), make_sensor(SENSORS["retina"])
+    assert canvas.in_place and not canvas.packed.in_place and canvas.packed.packed is canvas.packed
+    assert canvas.packed.config.rings == canvas.config.rings
+    assert retina.packed is retina

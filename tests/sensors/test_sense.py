@@ -13,8 +13,9 @@ from hypothesis import given, settings
 
 from foajax.config.parse import ConfigError
 from foajax.config.schema import LogPolarSensor, RingSensor
-from foajax.sensors.reconstruct import picture
-from foajax.sensors.sense import PixelCount, image_shapes, pixel_count, ring_boxes, sense
+from foajax.sensors.base import PixelCount, boxes
+from foajax.sensors.registry import make_sensor
+from foajax.sensors.sense import picture, sense
 
 DECREASING = ((30, 30, 1), (50, 50, 2), (70, 70, 4))
 # Table II: rings, peripheral grid, pixel-values there, and values shown by count of blocks and cells.
@@ -104,7 +105,7 @@ def test_table_ii_sensors_match_the_oracle(name):
     sensor = SENSORS[name]
     frames = random_frames((len(POINTS), 80, 80), np.uint8 if sensor.pooling == "stride" else np.float32)
     images = batched(sensor)(jnp.asarray(frames), jnp.asarray(POINTS))
-    assert tuple(image.shape[1:] for image in images) == image_shapes(sensor, (80, 80))
+    assert tuple(image.shape[1:3] for image in images) == make_sensor(sensor).image_shapes((80, 80))
     for index, (frame, point) in enumerate(zip(frames, POINTS, strict=True)):
         for image, wanted in zip(images, expected(frame, point, sensor), strict=True):
             assert image.dtype == jnp.float32
@@ -247,7 +248,7 @@ def test_odd_sizes_match_the_oracle(scene):
     # Each example is a program of its own: not worth the compiler's while.
     run = jax.jit(batched(sensor), compiler_options={"xla_backend_optimization_level": "0"})
     images = run(jnp.asarray(frames), jnp.array(points))
-    assert tuple(image.shape[1:] for image in images) == image_shapes(sensor, frame_shape)
+    assert tuple(image.shape[1:3] for image in images) == make_sensor(sensor).image_shapes(frame_shape)
     for index, (frame, point) in enumerate(zip(frames, points, strict=True)):
         for image, wanted in zip(images, expected(frame, point, sensor), strict=True):
             np.testing.assert_allclose(image[index, ..., 0], wanted, atol=1e-5)
@@ -315,29 +316,29 @@ def test_the_cost_does_not_grow_with_the_frame(layout):
 def test_pixel_counts_of_table_ii(name, distinct_frames):
     _, _, nominal, actual = TABLE_II[name]
     sensor = SENSORS[f"{name}-canvas-mean"]
-    assert pixel_count(sensor, (80, 80)) == PixelCount(nominal=nominal, actual=actual)
+    assert make_sensor(sensor).count((80, 80)) == PixelCount(nominal=nominal, actual=actual)
     # Independently: the number of different values on the canvas of a frame whose values all differ.
     (canvas,) = batched(sensor)(distinct_frames, jnp.asarray(POINTS))
     assert np.count_nonzero(np.unique(canvas[0])) == actual
 
 
 def test_counts_and_shapes_of_other_sensors():
-    assert pixel_count(LogPolarSensor(rings=20, wedges=24), (80, 80)) == PixelCount(480, 480)
-    assert image_shapes(LogPolarSensor(rings=20, wedges=24), (80, 80)) == ((20, 24, 1),)
+    assert make_sensor(LogPolarSensor(rings=20, wedges=24)).count((80, 80)) == PixelCount(480, 480)
+    assert make_sensor(LogPolarSensor(rings=20, wedges=24)).image_shapes((80, 80)) == ((20, 24),)
     # 7 by 3 is 3 blocks a side, all of them seen; 49 / 9 rounds to 5. No cell of the grid is covered.
     small = RingSensor(((7, 7, 3),), peripheral=(2, 2), layout="packed")
-    assert pixel_count(small, (20, 30)) == PixelCount(5 + 4, 9 + 4)
-    assert image_shapes(small, (20, 30)) == ((3, 3, 1), (2, 2, 1))
-    assert image_shapes(RingSensor(((7, 7, 3),)), (20, 30)) == ((20, 30, 1),)
+    assert make_sensor(small).count((20, 30)) == PixelCount(5 + 4, 9 + 4)
+    assert make_sensor(small).image_shapes((20, 30)) == ((3, 3), (2, 2))
+    assert make_sensor(RingSensor(((7, 7, 3),))).image_shapes((20, 30)) == ((20, 30),)
 
 
 def test_ring_boxes_frame_what_is_shown():
-    sensor = RingSensor(((5, 4, 1), (9, 8, 1)))
-    assert ring_boxes((10, 3), sensor) == [(8, 1, 5, 4), (6, -1, 9, 8)]
-    assert ring_boxes(jnp.array([10, 3]), sensor) == ring_boxes(np.array([10, 3]), sensor)
-    assert ring_boxes((40, 40), LogPolarSensor(radius=39.5)) == [(0, 0, 80, 80)]
+    sensor = make_sensor(RingSensor(((5, 4, 1), (9, 8, 1))))
+    assert boxes(sensor, (10, 3)) == [(8, 1, 5, 4), (6, -1, 9, 8)]
+    assert boxes(sensor, jnp.array([10, 3])) == boxes(sensor, np.array([10, 3]))
+    assert boxes(make_sensor(LogPolarSensor(radius=39.5)), (40, 40)) == [(0, 0, 80, 80)]
     (canvas,) = jax.jit(functools.partial(sense, sensor=sensor))(jnp.ones((30, 30)), jnp.array([10, 9]))
-    top, left, height, width = ring_boxes((10, 9), sensor)[-1]
+    top, left, height, width = boxes(sensor, (10, 9))[-1]
     assert canvas.sum() == canvas[top : top + height, left : left + width].sum() == height * width
 
 

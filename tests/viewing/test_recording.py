@@ -12,7 +12,6 @@ from foajax.envs.make import action_names, steps_per_second
 from foajax.learning.agent import Agent
 from foajax.sensors.frames import to_frame
 from foajax.sensors.gaze import DIRECTIONS, bounds
-from foajax.sensors.reconstruct import packed
 from foajax.types import Outcome, TimeStep
 from foajax.viewing import games
 from foajax.viewing.games import play
@@ -148,7 +147,7 @@ def test_a_recording_holds_what_the_sensor_gave(seeker):
     told = []
     game = next(record(seeker, max_steps=5, progress=lambda steps, score: told.append((steps, score))))
     assert [steps for steps, _ in told] == [1, 2, 3, 4, 5]
-    sensor = packed(seeker.agent.config.sensor)
+    sensor = seeker.agent.sensor.packed
     assert game.images[0].shape == (5, 25, 25) and sensor.layout == "packed"
     frames = [np.asarray(to_frame(jnp.asarray(screen[..., 0]), None)) for screen in game.screens]
     np.testing.assert_allclose(game.mean_frame, np.mean(frames, axis=0), atol=1e-6)
