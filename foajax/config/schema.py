@@ -178,7 +178,7 @@ class NetworkConfig(Section):
     core: str = Field("lstm", description="The memory: lstm, gru, mingru, none (no memory), or package.module:Class.")
     core_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the core.")
     dense: int = Field(256, ge=0, le=16_384, description="Units between torso and LSTM; 0 for none.")
-    dense_norm: bool = Field(False, description="Layer norm of what enters these units.")
+    dense_norm: bool = Field(True, description="Layer norm of what enters these units.")
     lstm: int = Field(256, ge=1, le=16_384, description="Units of the LSTM.")
     padding: Literal["cover", "valid"] = Field(
         "cover", description="Whether the nature torso sees what its strides would leave out (cover) or not (valid)."
@@ -221,7 +221,7 @@ class LearnerConfig(Section):
     clip_ratio: float | None = Field(0.1, gt=0, description="PPO's clipping of probability ratios; null for plain A2C.")
     learning_rate: float = Field(1e-3, gt=0, description="Adam's, after the warm-up.")
     full_rate_inputs: int | None = Field(
-        256, ge=1, le=10**9, description="Layers with more inputs learn at a rate that much smaller; null for none."
+        None, ge=1, le=10**9, description="Layers with more inputs learn at a rate that much smaller; null for none."
     )
     warmup_updates: int = Field(1000, ge=0, le=10**9, description="Updates over which the rate rises; 0 for none.")
     schedule: Literal["constant", "linear"] = Field(

@@ -65,9 +65,9 @@ class Network(nn.Module):
             for i, x in enumerate(images)
         ]
         features = jnp.concatenate(parts, axis=-1)
-        if self.config.dense_norm:
-            features = nn.LayerNorm(use_bias=False, use_scale=False, name="dense_norm")(features)
         if self.config.dense:
+            if self.config.dense_norm:  # so that one learning rate suits every sensor, however many features it has
+                features = nn.LayerNorm(use_bias=False, use_scale=False, name="dense_norm")(features)
             dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(RELU_GAIN), name="dense")
             features = nn.relu(dense(features))
         return features
