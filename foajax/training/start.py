@@ -74,9 +74,9 @@ def start(config: Config) -> None:
 def train_agent(config: Config) -> TrainedAgent:
     """Trains one agent, or goes on training it, in this process; gives it as its newest checkpoint has it.
 
-    As `python -m foajax.train` does, it writes to `config.run_dir`, prints to stderr and keeps compiled programs. It may be called from any
-    thread; in the main one, SIGINT, SIGTERM and SIGUSR1 end it early, with all that was learned saved. An environment
-    that hangs for longer than `env.timeout` ends the process.
+    As `python -m foajax.train` does, it writes to `config.run_dir`, prints to stderr, keeps compiled programs. It may
+    be called from any thread; in the main one, SIGINT, SIGTERM and SIGUSR1 end it early, with all that was learned
+    saved. An environment that hangs for longer than `env.timeout` ends the process.
 
     Args:
       config: from `foajax.compose([...])`.
