@@ -43,16 +43,6 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
     """
     if total_updates < 1:
         raise refuse("total_updates", total_updates, "an integer >= 1")
-
-    def schedule(count):
-        rate: Array | float = learner.learning_rate
-        if learner.warmup_updates:
-            rate *= jnp.minimum((count + 1) / learner.warmup_updates, 1.0)
-        if learner.schedule == "linear":
-            # The subtraction is in integers: the rate ends at 0 exactly, and never below.
-            rate *= jnp.maximum(total_updates - count, 0) / total_updates
-        return rate
-
     most, b1, b2 = learner.max_grad_norm, learner.adam_b1, learner.adam_b2
     clip = optax.identity() if most is None else optax.clip_by_global_norm(most)
     adam = optax.scale_by_adam(b1, b2, learner.adam_eps)
@@ -76,9 +66,20 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
             nu_max = jax.tree.map(jnp.maximum, nu_max, nu)
             first, second = optax.tree.bias_correction(mu, b1, count), optax.tree.bias_correction(nu_max, b2, count)
             change = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + learner.adam_eps), first, second)
-        rate = -schedule(state.count)
+        rate = -_rate(learner, total_updates, state.count)
         change = jax.tree.map(lambda u: jnp.where(accept, rate * share(u) * u, 0.0), change)
         after = AdamState(count=count, mu=mu, nu=nu, nu_max=nu_max)
         return change, jax.tree.map(lambda new, old: jnp.where(accept, new, old), after, state)
 
     return optax.GradientTransformationExtraArgs(init, update)
+
+
+def _rate(learner: LearnerConfig, total_updates: int, count: Int[Array, ""]) -> Array | float:
+    """The learning rate after `count` updates."""
+    rate: Array | float = learner.learning_rate
+    if learner.warmup_updates:
+        rate *= jnp.minimum((count + 1) / learner.warmup_updates, 1.0)
+    if learner.schedule == "linear":
+        # The subtraction is in integers: the rate ends at 0 exactly, and never below.
+        rate *= jnp.maximum(total_updates - count, 0) / total_updates
+    return rate
