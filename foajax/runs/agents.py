@@ -74,7 +74,7 @@ def load_agent(path: str | Path, *, best: bool = False) -> Stored:
     checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
     restored = checkpoints.restore_part({"train": template}, best=best)
     if restored is None:
-        raise ConfigError(f"run={path}: has no checkpoint yet")
+        raise refuse("run", path, "", why="has no checkpoint yet")
     env_steps, state, _ = restored
     return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
 
@@ -84,7 +84,7 @@ def check_source(path: str) -> None:
     try:
         load_config(path)
     except ConfigError as error:
-        raise ConfigError(f"train.init_from={path}: {error}") from None
+        raise refuse("train.init_from", path, "", why=str(error)) from None
 
 
 def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
@@ -97,7 +97,7 @@ def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
     try:
         stored = load_agent(path)
     except ConfigError as error:
-        raise ConfigError(f"{key}: {error}") from None
+        raise refuse(key, accepted="", why=str(error)) from None
     there, wanted = (named((s.params, s.statistics)) for s in (stored, state))
     for name in [*wanted, *there]:
         have, want = (arrays[name].shape if name in arrays else None for arrays in (there, wanted))
@@ -143,10 +143,11 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
     try:
         arrays = load_file(file)
     except (OSError, SafetensorError) as error:
-        raise ConfigError(f"run={file.parent}: {file.name} is not readable: {str(error).splitlines()[0]}") from None
+        raise refuse("run", file.parent, "", why=f"{file.name} is not readable: {str(error).splitlines()[0]}") from None
     names = named(wanted)
     if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
-        raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
+        why = f"{file.name} does not hold the parameters that config.yaml describes"
+        raise refuse("run", file.parent, "", why=why)
     leaves = [jnp.asarray(arrays[name]) for name in names]  # once: NumPy's would be handed over at each decision
     params, statistics = jax.tree.unflatten(jax.tree.structure(wanted), leaves)
     return Stored(agent, params, statistics, env_steps)
