@@ -29,8 +29,8 @@ def refuse(
 ) -> ConfigError:
     """The error, to be raised, about a key's value, or about a word by itself.
 
-    `accepted` says in words what the value may be, or is all of its choices: the one nearest to the value, or to `near`, is
-    suggested. `why` says what is wrong where that is not plain.
+    `accepted` says in words what the value may be, or is all of its choices: the one nearest to the value, or to
+    `near`, is suggested. `why` says what is wrong where that is not plain.
     """
     given = key if value is ABSENT else f"{key}={brief(value)}"
     if not isinstance(accepted, str):
