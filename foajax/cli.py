@@ -81,7 +81,7 @@ def write_json(key: str, path: str, found: Any) -> None:
         Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         print(text)
-        raise ConfigError(f"{key}={path}: cannot be written ({error.strerror}); it is printed above") from None
+        raise refuse(key, path, "", why=f"cannot be written ({error.strerror}); it is printed above") from None
 
 
 def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> int:

@@ -17,7 +17,7 @@ from typing import Literal
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import ConfigError, Section, refuse
+from foajax.config.parse import Section, refuse
 from foajax.reporting.curves import read_run
 from foajax.reporting.groups import games_of, runs_of
 from foajax.reporting.report_page import build, find_maps, note
@@ -54,7 +54,7 @@ def report(arguments: Sequence[str]) -> None:
     try:
         print(build(games, maps, out=options.out, preset=options.preset, repeats=options.repeats))
     except OSError as error:
-        raise ConfigError(f"out={options.out}: cannot be written ({error.strerror})") from None
+        raise refuse("out", options.out, "", why=f"cannot be written ({error.strerror})") from None
 
 
 if __name__ == "__main__":

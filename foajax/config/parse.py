@@ -28,22 +28,17 @@ def refuse(
     near: str | None = None,
     kind: type[ConfigError] = ConfigError,
 ) -> ConfigError:
-    """The error, to be raised, about a key's value, or about a word where there is no value.
+    """The error, to be raised, about a key's value, or about a word by itself.
 
-    Args:
-      key: as the user knows it, e.g. `learner.gamma`.
-      value: what it has.
-      accepted: what it may have, in words, or all of its choices, of which the nearest is suggested.
-      why: what is wrong, where that is not plain.
-      near: what the suggestion has to resemble; null for the value.
-      kind: of error.
+    `accepted` says in words what the value may be, or is all of its choices: the one nearest to the value, or to
+    `near`, is suggested. `why` says what is wrong where that is not plain.
     """
     given = key if value is ABSENT else f"{key}={brief(value)}"
     if not isinstance(accepted, str):
         choices = tuple(accepted)
         found = difflib.get_close_matches(str(value) if near is None else near, choices, n=1)
         accepted = f"one of {', '.join(choices)}" + "".join(f" (did you mean {name}?)" for name in found)
-    return kind(f"{given}: {why}{'; ' if why else ''}accepted is {accepted}")
+    return kind(f"{given}: " + "; ".join(filter(None, [why, accepted and f"accepted is {accepted}"])))
 
 
 def one_line(*parts: object) -> str:

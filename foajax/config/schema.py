@@ -123,10 +123,8 @@ class GazeConfig(Section):
     actions: Literal[5, 9] = Field(5, description="Stay, up, down, left, right; 9 adds the diagonals.")
     step: int = Field(4, ge=1, le=10_000, description="Frame pixels that a visual action moves.")
     bounds: Literal["window", "point"] = Field("window", description="What has to stay inside the frame.")
-    start: Literal["centre", "random"] | Point = Field(
-        "centre", description="Start of an episode, moved within bounds."
-    )
-    path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved within bounds.")
+    start: Literal["centre", "random"] | Point = Field("centre", description="Start of an episode, moved in bounds.")
+    path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved in bounds.")
 
     def check(self) -> None:
         if self.mode == "scripted" and not self.path:
@@ -146,9 +144,7 @@ class EnvConfig(Section):
     num_envs: int = Field(32, ge=1, le=100_000, description="Environments, of all processes together.")
     num_groups: int = Field(1, ge=1, description="Sets of environments that step in turn, while another decides.")
     frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
-    crop_top: Mapping[str, Row] = Field(
-        {"default": 34, "beam_rider": 20}, description="First screen row that is kept, by game."
-    )
+    crop_top: Mapping[str, Row] = Field({"default": 34, "beam_rider": 20}, description="First screen row, by game.")
     frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per step.")
     noop_max: int = Field(30, ge=0, le=200, description="No-ops before an episode are drawn from 0 to this.")
     clip_rewards: bool = Field(True, description="Clip rewards to [-1, 1] for learning.")
@@ -232,9 +228,7 @@ class LearnerConfig(Section):
     adam_b2: float = Field(0.999, ge=0, lt=1, description="Decay of Adam's second moment.")
     adam_eps: float = Field(1e-5, gt=0, description="Added to the root of the second moment.")
     max_grad_norm: float | None = Field(0.5, gt=0, description="Largest norm of the whole gradient; null for no limit.")
-    reduction: Literal["mean", "sum"] = Field(
-        "mean", description="Of losses over time; over environments always the mean."
-    )
+    reduction: Literal["mean", "sum"] = Field("mean", description="Of losses over time; else it is the mean.")
     normalize_advantages: bool = Field(True, description="Advantages of a minibatch get mean 0 and deviation 1.")
     value_weight: float = Field(0.5, ge=0, description="Weight of both value losses.")
     vision_weight: float = Field(0.25, ge=0, description="Weight of both of the vision head's losses.")
@@ -277,9 +271,7 @@ class DistributedConfig(Section):
     coordinator: str | None = Field(None, description="Address of process 0, host:port.")
     processes: int | None = Field(None, ge=1, description="How many processes share the run.")
     process: int | None = Field(None, ge=0, description="This one's number, from 0.")
-    timeout: float = Field(
-        180.0, gt=0, description="Seconds to wait for others before the run saves and ends; more than env.timeout."
-    )
+    timeout: float = Field(180.0, gt=0, description="Seconds that others are waited for; more than env.timeout.")
 
     def check(self) -> None:
         coordinator, processes, process = stated = (self.coordinator, self.processes, self.process)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from foajax.config.parse import ConfigError, refuse
+from foajax.config.parse import refuse
 from foajax.config.schema import Config
 from foajax.reporting.scores import CONFIDENCE, RESAMPLES, Interval
 from foajax.runs.agents import check_trust
@@ -68,7 +68,7 @@ def read_run(path: str | Path, *, trust: bool = False) -> RunData:
         if evaluation is not None:
             float(evaluation["mean"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"run={path}: its {file.name} is not readable") from None
+        raise refuse("run", path, "", why=f"its {file.name} is not readable") from None
     if not rows:
         raise refuse("run", path, "a run with scores", why="no game has ended in it yet")
     env_steps, time, score = (np.array([row[key] for row in rows], float) for key in ("env_steps", "time", "score"))

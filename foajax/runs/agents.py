@@ -142,7 +142,7 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False) -> 
     checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
     restored = checkpoints.restore_part({"train": template}, best=best)
     if restored is None:
-        raise ConfigError(f"run={path}: has no checkpoint yet")
+        raise refuse("run", path, "", why="has no checkpoint yet")
     env_steps, state, _ = restored
     return TrainedAgent(agent, state["train"].params, state["train"].statistics, env_steps)
 
@@ -152,7 +152,7 @@ def check_source(path: str) -> None:
     try:
         load_config(find(path))
     except ConfigError as error:
-        raise ConfigError(f"train.init_from={path}: {error}") from None
+        raise refuse("train.init_from", path, "", why=str(error)) from None
 
 
 def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
@@ -166,7 +166,7 @@ def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
         there = load_config(find(path)).code
         stored = load_agent(path, trust=set(there) <= set(config.code))  # what this run's own words name is trusted
     except ConfigError as error:
-        raise ConfigError(f"{key}: {error}") from None
+        raise refuse(key, accepted="", why=str(error)) from None
     arrays_there, wanted = (named((s.params, s.statistics)) for s in (stored, state))
     for name in [*wanted, *arrays_there]:
         have, want = (arrays[name].shape if name in arrays else None for arrays in (arrays_there, wanted))
@@ -212,10 +212,11 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> TrainedAgent:
     try:
         arrays = load_file(file)
     except (OSError, SafetensorError) as error:
-        raise ConfigError(f"run={file.parent}: {file.name} is not readable: {str(error).splitlines()[0]}") from None
+        raise refuse("run", file.parent, "", why=f"{file.name} is not readable: {str(error).splitlines()[0]}") from None
     names = named(wanted)
     if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
-        raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
+        why = f"{file.name} does not hold the parameters that config.yaml describes"
+        raise refuse("run", file.parent, "", why=why)
     leaves = [jnp.asarray(arrays[name]) for name in names]  # once: NumPy's would be handed over at each decision
     params, statistics = jax.tree.unflatten(jax.tree.structure(wanted), leaves)
     return TrainedAgent(agent, params, statistics, env_steps)

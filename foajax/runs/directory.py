@@ -90,7 +90,9 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
     except FileExistsError:
         raise refuse("run", path, "a directory", why="is a file", kind=RunError) from None
     except (OSError, ValueError) as error:
-        raise RunError(f"run={path}: cannot be created ({reason_of(error)}); choose another run=<dir>") from None
+        raise refuse(
+            "run", path, "", why=f"cannot be created ({reason_of(error)}); choose another run=<dir>", kind=RunError
+        ) from None
     if os.path.lexists(path / PARAMETERS):
         accepted = f"another run=<dir>, with train.init_from={path} to begin from its parameters"
         raise refuse("run", path, accepted, why="is a shipped agent", kind=RunError)
@@ -101,7 +103,9 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
         (path / _FAILURE).unlink(missing_ok=True)
     except OSError as error:
         run_dir.close()
-        raise RunError(f"run={path}: cannot be used ({reason_of(error)}); choose another run=<dir>") from None
+        raise refuse(
+            "run", path, "", why=f"cannot be used ({reason_of(error)}); choose another run=<dir>", kind=RunError
+        ) from None
     except BaseException:
         run_dir.close()
         raise
@@ -137,11 +141,13 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         what = there if os.path.exists(path) else "does not exist"
         raise refuse("run", path, "the directory of a run", why=what, kind=RunError) from None
     except ConfigError as error:
-        raise RunError(f"{file}: {error}") from None
+        raise refuse(str(file), accepted="", why=str(error), kind=RunError) from None
     except OSError as error:
-        raise RunError(f"{file}: cannot be read ({reason_of(error)})") from None
+        raise refuse(str(file), accepted="", why=f"cannot be read ({reason_of(error)})", kind=RunError) from None
     except Exception as error:  # a file of any content ends up here
-        raise RunError(f"{file}: is not the configuration of a run ({reason_of(error)})") from None
+        raise refuse(
+            str(file), accepted="", why=f"is not the configuration of a run ({reason_of(error)})", kind=RunError
+        ) from None
     return replace(config, run=str(path))
 
 
@@ -203,7 +209,7 @@ def check_same_run(path: Path, config: Config) -> None:
         remedy = "choose another run=<dir> or restore the value"
         if keys[0] == "train.env_steps":
             remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
-        raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
+        raise refuse(keys[0], new, "", why=f"the run in {path} has {old}; {remedy}", kind=RunError)
 
 
 def _has_begun(path: Path) -> bool:

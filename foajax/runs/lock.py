@@ -8,7 +8,7 @@ import socket
 import time
 from pathlib import Path
 
-from foajax.config.parse import ConfigError, one_line
+from foajax.config.parse import ConfigError, one_line, refuse
 
 
 class RunError(ConfigError):
@@ -32,7 +32,9 @@ def take_lock(path: Path) -> int:
     try:
         lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
-        raise RunError(f"run={path}: cannot be written ({reason_of(error)}); choose another run=<dir>") from None
+        raise refuse(
+            "run", path, "", why=f"cannot be written ({reason_of(error)}); choose another run=<dir>", kind=RunError
+        ) from None
     try:
         _lock(lock)
         os.ftruncate(lock, 0)
@@ -40,10 +42,14 @@ def take_lock(path: Path) -> int:
     except BlockingIOError:
         holder = os.read(lock, 200).decode(errors="replace").strip() or "another process"
         os.close(lock)
-        raise RunError(f"run={path}: in use by {holder}; end it or choose another run=<dir>") from None
+        raise refuse(
+            "run", path, "", why=f"in use by {holder}; end it or choose another run=<dir>", kind=RunError
+        ) from None
     except OSError as error:
         os.close(lock)
-        raise RunError(f"run={path}: cannot be locked ({reason_of(error)}); choose another run=<dir>") from None
+        raise refuse(
+            "run", path, "", why=f"cannot be locked ({reason_of(error)}); choose another run=<dir>", kind=RunError
+        ) from None
     return lock
 
 

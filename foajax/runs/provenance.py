@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from foajax.config.parse import refuse
 from foajax.runs import durable
 from foajax.runs.lock import RunError
 
@@ -38,7 +39,7 @@ def record_start(path: Path, command: Sequence[str], devices: Sequence[str]) -> 
         record = json.loads(file.read_text(encoding="utf-8")) if os.path.lexists(file) else {"starts": []}
         record["starts"].append(_describe_start(command, devices))
     except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
-        raise RunError(f"{file}: is not the record of a run; move it away") from None
+        raise refuse(str(file), accepted="", why="is not the record of a run; move it away", kind=RunError) from None
     durable.replace(file, (json.dumps(record, indent=1) + "\n").encode())
 
 

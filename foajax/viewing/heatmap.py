@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from foajax.config.parse import ConfigError
+from foajax.config.parse import refuse
 from foajax.runs import durable
 from foajax.sensors.gaze import bounds, count
 from foajax.viewing.recording import Recording
@@ -119,7 +119,7 @@ def read(file: Path) -> HeatMap:
     try:
         return HeatMap.from_json(json.loads(file.read_text()))
     except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{file}: is no heat map; remove it") from None
+        raise refuse(str(file), accepted="", why="is no heat map; remove it") from None
 
 
 def draw(heat: HeatMap, title: str) -> Figure:
