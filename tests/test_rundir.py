@@ -126,7 +126,7 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     package = tmp_path / "checkout" / "foajax"
     package.mkdir(parents=True)
     monkeypatch.setattr(rundir, "__file__", str(package / "rundir.py"))
-    assert rundir._commit() is None
+    assert rundir.commit() is None
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
     (package / "file").write_text("one")
@@ -137,12 +137,12 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     ):
         subprocess.run(["git", *words], cwd=package.parent, check=True)
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=package, capture_output=True, text=True).stdout.strip()
-    assert rundir._commit() == head
+    assert rundir.commit() == head
     (package / "file").write_text("two")
-    assert rundir._commit() == f"{head}-dirty"
+    assert rundir.commit() == f"{head}-dirty"
     installed = package / "venv" / "foajax"
     monkeypatch.setattr(rundir, "__file__", str(installed / "rundir.py"))
-    assert rundir._commit() is None
+    assert rundir.commit() is None
 
 
 # What may change between two starts

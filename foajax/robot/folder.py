@@ -1,0 +1,187 @@
+"""Writes the folder: the network, what the sensor needs, the facts, the recorded steps and the code that runs them."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from foajax import __version__, envs, gaze, logpolar, rundir
+from foajax.agent import Agent
+from foajax.config import Config, ConfigError, LogPolarSensor, to_mapping
+from foajax.foveation import sense
+from foajax.frames import SMALLEST_STD
+from foajax.painting import packed, tables
+from foajax.robot import golden, onnx_graph
+from foajax.store import Stored, load_score
+from foajax.types import FrameStatistics
+
+FORMAT = 1
+FACTS = "agent.json"
+CODE = ("agent.py", "check.py", "camera.py", "node.py")  # copied as they are
+_TIMEOUT = 600.0  # seconds that the check may take
+
+
+def write(stored: Stored, out: Path, *, source: str, command: Sequence[str] = ()) -> str:
+    """Writes an agent to `out`, which appears whole, once its own check has passed; gives what the check says.
+
+    Args:
+      stored: the agent.
+      out: a new directory, or one that an earlier export has written.
+      source: the run or agent that it was read from, for the record.
+      command: likewise.
+
+    Raises:
+      ConfigError: `out` is something else or cannot be written; the network has a part that cannot be exported; the
+        game cannot be played here; the check fails.
+    """
+    if out.exists() and not (out.is_dir() and (_is_export(out) or not any(out.iterdir()))):
+        raise ConfigError(f"out={out}: accepted is a new directory, or one that export has written")
+    model = onnx_graph.policy(stored.agent, stored.params, _labels(stored))
+    facts = _facts(stored) | {"provenance": _provenance(stored, source, command)}
+    arrays: dict[str, Any] = _arrays(stored.agent, stored.statistics)
+    recorded: dict[str, Any] = golden.record(stored)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as made:
+            folder = Path(made) / out.name
+            folder.mkdir()
+            (folder / "policy.onnx").write_bytes(model.SerializeToString())
+            np.savez_compressed(folder / "arrays.npz", **arrays)
+            np.savez_compressed(folder / "golden.npz", **recorded)
+            for name in CODE:
+                shutil.copyfile(Path(__file__).parent / name, folder / name)
+            digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(folder.iterdir())}
+            (folder / FACTS).write_text(json.dumps(facts | {"files": digests}, indent=1) + "\n", encoding="utf-8")
+            found = run_check(folder)
+            shutil.rmtree(out, ignore_errors=True)
+            folder.rename(out)
+    except OSError as error:
+        raise ConfigError(f"out={out}: accepted is a directory that can be written ({error.strerror})") from None
+    return found
+
+
+def run_check(folder: Path) -> str:
+    """Runs `agent.py --check` in a process of its own; `ConfigError` with its message where it fails."""
+    command = [sys.executable, str(folder / "agent.py"), "--check"]
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        raise ConfigError(f"export: the folder's check took longer than {_TIMEOUT:.0f} s; nothing is written") from None
+    if ended.returncode:
+        why = (ended.stderr.strip().splitlines() or ["no message"])[-1]
+        raise ConfigError(f"export: the folder's own check fails ({why}); nothing is written")
+    return ended.stdout.strip()
+
+
+def _is_export(directory: Path) -> bool:
+    try:
+        return "format" in json.loads((directory / FACTS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+
+
+def _facts(stored: Stored) -> dict[str, Any]:
+    """What `agent.py` is told besides arrays."""
+    agent = stored.agent
+    config, network = agent.config, agent.config.network
+    width = onnx_graph.side_width(agent)
+    last = [agent.num_actions, agent.network.num_vision_actions] if network.last_actions else None
+    sees_point = width - sum(last or ()) - network.last_reward > 0
+    names = envs.action_names(config) or tuple(f"action {i}" for i in range(agent.num_actions))
+    return {
+        "format": FORMAT,
+        "game": config.game,
+        "experiment": config.name,
+        "actions": list(names),
+        "visual_actions": list(gaze.NAMES[: config.gaze.actions]),
+        "steps_per_second": envs.steps_per_second(config),
+        "source": "camera" if agent.crop_top is None else "screen",
+        "crop_top": agent.crop_top,
+        "frame_shape": list(config.env.frame_shape),
+        "normalisation": _normalisation(agent, stored.statistics),
+        "sensor": to_mapping(config.sensor),
+        "window": list(config.sensor.window),
+        "gaze": _gaze(config),
+        "side": {
+            "focal_point": network.focal_scale if sees_point else None,
+            "last_actions": last,
+            "last_reward": network.last_reward,
+            "clip_reward": config.env.clip_rewards and config.game not in envs.OWN,
+        },
+        "core": {state: network.lstm for state in ("cell", "hidden")},
+    }
+
+
+def _normalisation(agent: Agent, statistics: FrameStatistics) -> str:
+    """Whose mean and deviation; while running ones have seen nothing, they are the frame's own."""
+    mode = agent.config.network.normalization
+    return "frame" if mode in ("running", "pixel") and not statistics.weight > 0 else mode
+
+
+def _gaze(config: Config) -> dict[str, Any]:
+    """The gaze with its points moved within bounds."""
+    look = config.gaze
+    low, high = gaze.limits(gaze=look, window=config.sensor.window, frame_shape=config.env.frame_shape)
+    path = [np.clip(point, low, high).tolist() for point in look.path]
+    start: Any = path[0] if look.mode == "scripted" else look.start
+    if start == "centre":
+        start = [size // 2 for size in config.env.frame_shape]
+    if start != "random":
+        start = np.clip(start, low, high).tolist()
+    facts = {"mode": look.mode, "actions": look.actions, "step": look.step, "bounds": look.bounds}
+    return facts | {"start": start, "path": path, "limits": [low.tolist(), high.tolist()]}
+
+
+def _arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
+    """The normalisation, bias-corrected, and what the sensor's arithmetic is made of."""
+    sensor, shape = agent.config.sensor, agent.config.env.frame_shape
+    mean, std = np.zeros(shape, np.float32), np.float32(1)
+    if _normalisation(agent, statistics) in ("running", "pixel"):
+        mean = np.array(np.broadcast_to(np.asarray(statistics.mean / statistics.weight), shape))
+        std = np.maximum(np.asarray(statistics.std / statistics.weight), np.float32(SMALLEST_STD))
+    arrays: dict[str, Any] = {"mean": mean, "std": std}
+    if isinstance(sensor, LogPolarSensor):
+        cell, pixel, share = logpolar.shares(sensor)
+        first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
+        return arrays | {"pixel": pixel.astype(np.int32), "share": share.astype(np.float32), "first": first}
+    # A frame of ones shows which blocks a finer ring hides.
+    seen = sense(jnp.ones(shape), jnp.array(shape) // 2, sensor=packed(sensor))
+    for i in range(len(sensor.rings)):
+        arrays[f"visible_{i}"] = np.asarray(seen[i][..., 0] > 0, np.float32)
+    if sensor.peripheral is not None:
+        rows, columns = (np.arange(n + 1) * size // n for n, size in zip(sensor.peripheral, shape, strict=True))
+        arrays |= {"row_edges": rows, "column_edges": columns}
+    if sensor.layout == "canvas":
+        painting = tables(packed(sensor), shape)
+        arrays |= {"paint_window": painting.window, "paint_background": painting.background}
+    return arrays
+
+
+def _labels(stored: Stored) -> Mapping[str, str]:
+    config = stored.agent.config
+    return {"game": config.game, "experiment": config.name, "env_steps": str(stored.env_steps)}
+
+
+def _provenance(stored: Stored, source: str, command: Sequence[str]) -> dict[str, Any]:
+    """Where the agent comes from; the training's commit is that of the run's last start, None of a shipped agent."""
+    return {
+        "run": source,
+        "env_steps": stored.env_steps,
+        "score": load_score(source),
+        "trained_with": rundir.last_commit(Path(source)),
+        "exported_with": rundir.commit(),
+        "foajax": __version__,
+        "command": list(command),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+    }
