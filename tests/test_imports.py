@@ -66,6 +66,7 @@ MEETING = {
     "drawing",
     "dump",
     "evaluate",
+    "export",
     "heatmap",
     "painting",
     "player",

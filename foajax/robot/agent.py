@@ -54,9 +54,7 @@ class Agent:
         self.greedy, self.source = greedy, source or self.facts["source"]
         if self.source not in ("screen", "camera") or (self.source == "screen" and self.facts["crop_top"] is None):
             raise AgentError(f"source={self.source}: accepted is camera, or screen where the agent plays Atari")
-        if order not in ("rgb", "bgr"):
-            raise AgentError(f"order={order}: accepted is rgb or bgr")
-        self._luma = LUMA if order == "rgb" else LUMA[::-1]
+        self.order = order
         self._random = np.random.default_rng(seed)
         self._limits = np.array(self.facts["gaze"]["limits"])  # smallest and largest focal point
         with np.load(self.folder / "arrays.npz") as arrays:
@@ -65,12 +63,13 @@ class Agent:
         options.intra_op_num_threads, options.inter_op_num_threads, options.log_severity_level = 1, 1, 3
         network = str(self.folder / "policy.onnx")
         self._session = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
-        self._outputs = [output.name for output in self._session.get_outputs()]
+        self._outputs = {output.name: output.shape for output in self._session.get_outputs()}
         self.reset()
 
     def reset(self) -> None:
         """Begins an episode: empty memory, the gaze at its start, no last action."""
-        self.core = {name: np.zeros((1, width), np.float32) for name, width in self.facts["core"].items()}
+        states = {name[5:]: shape[1:] for name, shape in self._outputs.items() if name.startswith("next_")}
+        self.core = {name: np.zeros((1, *shape), np.float32) for name, shape in states.items()}
         self.age = 0  # decisions since the episode began
         self.last_actions: tuple[int, int] | None = None  # change it where the robot did something else
         start, low, high = self.facts["gaze"]["start"], *self._limits
@@ -85,11 +84,8 @@ class Agent:
           AgentError: the frame is not as the agent takes it. The agent's state is as before then.
         """
         images = self._sensor.look(self.frame(frame), self.focal_point)
-        feed = {f"image_{i}": image[None, None] for i, image in enumerate(images)}
-        side = self._side(reward)
-        if len(side):
-            feed["side"] = side[None]
-        outputs = dict(zip(self._outputs, self._session.run(self._outputs, feed | self.core), strict=True))
+        feed = {f"image_{i}": image[None, None] for i, image in enumerate(images)} | self._side(reward)
+        outputs = dict(zip(self._outputs, self._session.run([*self._outputs], feed | self.core), strict=True))
         natural, vision, gaze = self._choose(outputs["natural_logits"]), 0, self.facts["gaze"]
         if gaze["mode"] in ("learned", "random"):
             drawn = gaze["mode"] == "random"
@@ -111,10 +107,12 @@ class Agent:
         if not is_camera:
             return halve(image, self.facts["crop_top"])
         if shape != tuple(self.facts["frame_shape"]):
-            image = shrink(image, self.facts["frame_shape"], self._luma)
+            if self.order not in ("rgb", "bgr"):
+                raise AgentError(f"order={self.order}: accepted is rgb or bgr")
+            image = shrink(image, self.facts["frame_shape"], LUMA if self.order == "rgb" else LUMA[::-1])
         return image.astype(np.float32) * np.float32(1 / 255)
 
-    def _side(self, reward: float) -> np.ndarray:
+    def _side(self, reward: float) -> dict[str, np.ndarray]:
         """What the network is told beside the images."""
         told, parts = self.facts["side"], []
         low, high = self._limits
@@ -129,7 +127,7 @@ class Agent:
             raise AgentError(f"reward={reward}: accepted is a finite number")
         if told["last_reward"]:
             parts.append([0.0 if self.last_actions is None else np.sign(reward) if told["clip_reward"] else reward])
-        return np.concatenate([np.zeros(0), *parts]).astype(np.float32)
+        return {"side": np.concatenate(parts).astype(np.float32)[None]} if parts else {}
 
     def _choose(self, logits: np.ndarray) -> int:
         # The largest of logits with Gumbel noise is a draw from their softmax.
@@ -209,16 +207,16 @@ def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray) -> n
     """A camera's image [h, w] or [h, w, 3] as a gray frame, uint8 [H, W]: area means, rounded half up.
 
     An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
-    each pixel first, so that one pixel in some fifty may differ, by one gray level.
+    each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
     """
     axes = list(zip(image.shape, frame_shape, strict=False))
-    if all(size >= 2 * wanted for size, wanted in axes):
-        means = _add_up(np.ascontiguousarray(image), [_spans(*axis) for axis in axes], luma)
-    else:
-        if image.ndim == 3:
-            image = (image @ np.rint(1000 * luma).astype(int) + 500) // 1000
+    if image.ndim == 3 and any(size < 2 * wanted for size, wanted in axes):
+        image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
+    if any(size < wanted for size, wanted in axes):
         rows, columns = (_weights(*axis) for axis in axes)
         means = rows @ image.astype(np.float32) @ columns.T
+    else:
+        means = _add_up(np.ascontiguousarray(image), [_spans(*axis) for axis in axes], luma)
     return np.floor(means + np.float32(0.5)).astype(np.uint8)
 
 

@@ -22,9 +22,9 @@ def check(folder: Path) -> dict[str, Any]:
       AgentError: something differs; the message says what comes first.
     """
     agent = Agent(folder, greedy=True)
+    _check_files(agent)
     with np.load(folder / "golden.npz") as arrays:
         golden = dict(arrays)
-    _check_files(agent)
     _check_images(agent, golden)
     gaze, largest, seconds = agent.facts["gaze"], 0.0, []
     for step, frame in enumerate(golden["frame"]):
@@ -67,7 +67,8 @@ def main(words: Sequence[str]) -> int:
 
 def _check_files(agent: Agent) -> None:
     for name, digest in agent.facts["files"].items():
-        if hashlib.sha256((agent.folder / name).read_bytes()).hexdigest() != digest:
+        file = agent.folder / name
+        if not file.exists() or hashlib.sha256(file.read_bytes()).hexdigest() != digest:
             if name.endswith(".py"):
                 print(f"check: {name} has been changed since the export", file=sys.stderr)
             else:

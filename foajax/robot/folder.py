@@ -33,7 +33,7 @@ _TIMEOUT = 600.0  # seconds that the check may take
 
 
 def write(stored: Stored, out: Path, *, source: str, command: Sequence[str] = ()) -> str:
-    """Writes an agent to `out`, which appears whole, once its own check has passed; gives what the check says.
+    """Writes an agent to `out`, once the folder's own check has passed; gives what the check says.
 
     Args:
       stored: the agent.
@@ -47,28 +47,39 @@ def write(stored: Stored, out: Path, *, source: str, command: Sequence[str] = ()
     """
     if out.exists() and not (out.is_dir() and (_is_export(out) or not any(out.iterdir()))):
         raise ConfigError(f"out={out}: accepted is a new directory, or one that export has written")
-    model = onnx_graph.policy(stored.agent, stored.params, _labels(stored))
-    facts = _facts(stored) | {"provenance": _provenance(stored, source, command)}
-    arrays: dict[str, Any] = _arrays(stored.agent, stored.statistics)
-    recorded: dict[str, Any] = golden.record(stored)
+    recorded, provenance = golden.record(stored), _provenance(stored, source, command)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as made:
             folder = Path(made) / out.name
-            folder.mkdir()
-            (folder / "policy.onnx").write_bytes(model.SerializeToString())
-            np.savez_compressed(folder / "arrays.npz", **arrays)
-            np.savez_compressed(folder / "golden.npz", **recorded)
-            for name in CODE:
-                shutil.copyfile(Path(__file__).parent / name, folder / name)
-            digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(folder.iterdir())}
-            (folder / FACTS).write_text(json.dumps(facts | {"files": digests}, indent=1) + "\n", encoding="utf-8")
+            fill(folder, stored, recorded, provenance)
             found = run_check(folder)
-            shutil.rmtree(out, ignore_errors=True)
-            folder.rename(out)
+            out.mkdir(exist_ok=True)
+            for name in sorted(file.name for file in folder.iterdir() if file.is_file()):
+                (folder / name).replace(out / name)  # what else lies there is the user's
     except OSError as error:
         raise ConfigError(f"out={out}: accepted is a directory that can be written ({error.strerror})") from None
     return found
+
+
+def fill(folder: Path, stored: Stored, recorded: dict[str, Any], provenance: Mapping[str, Any]) -> None:
+    """Makes the folder, without a check: network, arrays, recorded steps, code, and the facts with all checksums."""
+    folder.mkdir()
+    model = onnx_graph.policy(stored.agent, stored.params, _labels(stored))
+    (folder / "policy.onnx").write_bytes(model.SerializeToString())
+    contents: dict[str, Any] = arrays(stored.agent, stored.statistics)
+    np.savez_compressed(folder / "arrays.npz", **contents)
+    np.savez_compressed(folder / "golden.npz", **recorded)
+    for name in CODE:
+        shutil.copyfile(Path(__file__).parent / name, folder / name)
+    digests = {file.name: digest(file) for file in sorted(folder.iterdir())}
+    text = json.dumps(facts(stored) | {"provenance": provenance, "files": digests}, indent=1)
+    (folder / FACTS).write_text(text + "\n", encoding="utf-8")
+
+
+def digest(file: Path) -> str:
+    """The checksum by which `agent.py` knows a file again."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def run_check(folder: Path) -> str:
@@ -87,11 +98,11 @@ def run_check(folder: Path) -> str:
 def _is_export(directory: Path) -> bool:
     try:
         return "format" in json.loads((directory / FACTS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError):
         return False
 
 
-def _facts(stored: Stored) -> dict[str, Any]:
+def facts(stored: Stored) -> dict[str, Any]:
     """What `agent.py` is told besides arrays."""
     agent = stored.agent
     config, network = agent.config, agent.config.network
@@ -119,7 +130,6 @@ def _facts(stored: Stored) -> dict[str, Any]:
             "last_reward": network.last_reward,
             "clip_reward": config.env.clip_rewards and config.game not in envs.OWN,
         },
-        "core": {state: network.lstm for state in ("cell", "hidden")},
     }
 
 
@@ -143,29 +153,29 @@ def _gaze(config: Config) -> dict[str, Any]:
     return facts | {"start": start, "path": path, "limits": [low.tolist(), high.tolist()]}
 
 
-def _arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
+def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
     """The normalisation, bias-corrected, and what the sensor's arithmetic is made of."""
     sensor, shape = agent.config.sensor, agent.config.env.frame_shape
     mean, std = np.zeros(shape, np.float32), np.float32(1)
     if _normalisation(agent, statistics) in ("running", "pixel"):
         mean = np.array(np.broadcast_to(np.asarray(statistics.mean / statistics.weight), shape))
         std = np.maximum(np.asarray(statistics.std / statistics.weight), np.float32(SMALLEST_STD))
-    arrays: dict[str, Any] = {"mean": mean, "std": std}
+    found: dict[str, Any] = {"mean": mean, "std": std}
     if isinstance(sensor, LogPolarSensor):
         cell, pixel, share = logpolar.shares(sensor)
         first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
-        return arrays | {"pixel": pixel.astype(np.int32), "share": share.astype(np.float32), "first": first}
+        return found | {"pixel": pixel.astype(np.int32), "share": share.astype(np.float32), "first": first}
     # A frame of ones shows which blocks a finer ring hides.
     seen = sense(jnp.ones(shape), jnp.array(shape) // 2, sensor=packed(sensor))
     for i in range(len(sensor.rings)):
-        arrays[f"visible_{i}"] = np.asarray(seen[i][..., 0] > 0, np.float32)
+        found[f"visible_{i}"] = np.asarray(seen[i][..., 0] > 0, np.float32)
     if sensor.peripheral is not None:
         rows, columns = (np.arange(n + 1) * size // n for n, size in zip(sensor.peripheral, shape, strict=True))
-        arrays |= {"row_edges": rows, "column_edges": columns}
+        found |= {"row_edges": rows, "column_edges": columns}
     if sensor.layout == "canvas":
         painting = tables(packed(sensor), shape)
-        arrays |= {"paint_window": painting.window, "paint_background": painting.background}
-    return arrays
+        found |= {"paint_window": painting.window, "paint_background": painting.background}
+    return found
 
 
 def _labels(stored: Stored) -> Mapping[str, str]:

@@ -1,0 +1,91 @@
+"""The ONNX graph gives what the JAX network gives, whatever it is made of."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foajax.config import ConfigError
+from foajax.types import CoreState
+
+onnx = pytest.importorskip("onnx", reason="needs the extra robot")
+onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra robot")
+onnx_graph = pytest.importorskip("foajax.robot.onnx_graph", reason="needs the extra robot")
+
+NETWORKS = {
+    "one image": ["experiment=constant70_packed"],
+    "periphery": ["experiment=constant70_p_packed"],
+    "rings": ["experiment=decreasing_p_packed"],
+    "canvas": ["experiment=nonfoa"],
+    "left out borders": ["experiment=nonfoa", "network.padding=valid"],
+    "small images": ["sensor.rings=[[20,20,1],[60,60,3]]", "sensor.layout=packed"],
+    "log-polar": ["experiment=logpolar"],
+    "a3c": ["experiment=constant70", "network=a3c", *("network.dense=8", "network.lstm=8")],
+    "a3c of a small image": ["experiment=constant50_sub2_packed", "network.torso=a3c"],
+    "no dense layer": ["experiment=constant70_p_packed", "network.dense=0"],
+    "norms": ["experiment=constant70_p_packed", "network.dense_norm=true"],
+    "no norm": ["experiment=constant70_packed", "network.lstm_norm=false"],
+    "told nothing": [
+        *("experiment=nonfoa", "network.last_actions=false", "network.last_reward=false"),
+    ],
+}
+
+
+@pytest.mark.parametrize("words", NETWORKS.values(), ids=NETWORKS)
+def test_the_graph_is_the_network(words, make_stored):
+    stored = make_stored(*words)
+    model = onnx_graph.policy(stored.agent, stored.params, {})
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    random = np.random.default_rng(0)
+    for batch in (1, 3):
+        feed = {i.name: random.normal(size=(batch, *i.shape[1:])).astype(np.float32) for i in session.get_inputs()}
+        found = dict(zip([o.name for o in session.get_outputs()], session.run(None, feed), strict=True))
+        images = [jnp.asarray(x).transpose(0, 2, 3, 1)[None] for name, x in feed.items() if name.startswith("image")]
+        side = feed.get("side", np.zeros((batch, 0), np.float32))[None]
+        state = CoreState(cell=jnp.asarray(feed["cell"]), hidden=jnp.asarray(feed["hidden"]))
+        inputs = images, jnp.asarray(side), jnp.zeros((1, batch), bool), state
+        output, state = jax.jit(stored.agent.forward)(stored.params, *inputs)
+        wanted = {"natural_logits": output.natural_logits[0], "natural_value": output.natural_value[0][:, None]}
+        if output.vision_logits is not None:
+            wanted |= {"vision_logits": output.vision_logits[0], "vision_value": output.vision_value[0][:, None]}
+        wanted |= {"next_cell": state.cell, "next_hidden": state.hidden}
+        assert set(found) == set(wanted)
+        for name, value in wanted.items():
+            np.testing.assert_allclose(found[name], value, atol=1e-5, err_msg=name)
+
+
+def test_the_file_says_what_it_is(make_stored):
+    stored = make_stored("experiment=constant70_p_packed")
+    model = onnx_graph.policy(stored.agent, stored.params, {"game": "breakout"})
+    onnx.checker.check_model(model, full_check=True)
+    assert [(o.domain, o.version) for o in model.opset_import] == [("", onnx_graph.OPSET)]
+    assert {p.key: p.value for p in model.metadata_props} == {"game": "breakout"}
+    for value in (*model.graph.input, *model.graph.output):
+        assert value.type.tensor_type.shape.dim[0].dim_param == "batch"
+    known = {value.name for value in model.graph.value_info}
+    named = {name for node in model.graph.node for name in node.output}
+    assert named <= known | {value.name for value in model.graph.output}  # every shape is inferred
+
+
+def test_a_part_that_nobody_knows_is_refused(make_stored):
+    stored = make_stored("experiment=constant70_packed")
+    params = {"params": stored.params["params"] | {"attention": {"kernel": np.zeros((2, 2), np.float32)}}}
+    with pytest.raises(ConfigError, match="network: attention/kernel cannot be exported; accepted are lstm cores"):
+        onnx_graph.policy(stored.agent, params, {})
+
+
+def test_a_part_that_is_missing_is_refused(make_stored):
+    stored = make_stored("experiment=constant70_packed")
+    params = {"params": {name: part for name, part in stored.params["params"].items() if name != "dense"}}
+    with pytest.raises(ConfigError, match="network: has no dense/kernel"):
+        onnx_graph.policy(stored.agent, params, {})
+
+
+def test_another_core_is_refused():
+    class Other:
+        core = "attention"
+
+    with pytest.raises(ConfigError, match="network.core=attention: accepted by export are lstm"):
+        onnx_graph.core(Other())
