@@ -22,23 +22,31 @@ from foajax.config import Config, ConfigError, LogPolarSensor, to_mapping
 from foajax.foveation import sense
 from foajax.frames import SMALLEST_STD
 from foajax.painting import packed, tables
-from foajax.robot import golden, onnx_graph
+from foajax.robot import golden, onnx_graph, smaller
 from foajax.store import Stored, load_score
 from foajax.types import FrameStatistics
 
 FORMAT = 1
+WEIGHTS = {"float32": lambda model: model, "float16": smaller.float16, "int8": smaller.int8}
+# Of the recorded steps: by how much logits may differ, and what share of the actions must be the same.
+CHECKS = {
+    "float32": {"logits": 1e-4, "same": 1.0},
+    "float16": {"logits": 0.1, "same": 0.98},
+    "int8": {"logits": 2.0, "same": 0.8},
+}
 FACTS = "agent.json"
 CODE = ("agent.py", "check.py", "camera.py", "node.py")  # copied as they are
 _TIMEOUT = 600.0  # seconds that the check may take
 
 
-def write(stored: Stored, out: Path, *, source: str, command: Sequence[str] = ()) -> str:
+def write(stored: Stored, out: Path, *, source: str, dtype: str = "float32", command: Sequence[str] = ()) -> str:
     """Writes an agent to `out`, once the folder's own check has passed; gives what the check says.
 
     Args:
       stored: the agent.
       out: a new directory, or one that an earlier export has written.
       source: the run or agent that it was read from, for the record.
+      dtype: what the network's weights are stored in, one of `CHECKS`.
       command: likewise.
 
     Raises:
@@ -52,7 +60,7 @@ def write(stored: Stored, out: Path, *, source: str, command: Sequence[str] = ()
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as made:
             folder = Path(made) / out.name
-            fill(folder, stored, recorded, provenance)
+            fill(folder, stored, recorded, provenance, dtype)
             found = run_check(folder)
             out.mkdir(exist_ok=True)
             for name in sorted(file.name for file in folder.iterdir() if file.is_file()):
@@ -62,10 +70,12 @@ def write(stored: Stored, out: Path, *, source: str, command: Sequence[str] = ()
     return found
 
 
-def fill(folder: Path, stored: Stored, recorded: dict[str, Any], provenance: Mapping[str, Any]) -> None:
+def fill(
+    folder: Path, stored: Stored, recorded: dict[str, Any], provenance: Mapping[str, Any], dtype: str = "float32"
+) -> None:
     """Makes the folder, without a check: network, arrays, recorded steps, code, and the facts with all checksums."""
     folder.mkdir()
-    model = onnx_graph.policy(stored.agent, stored.params, _labels(stored))
+    model = WEIGHTS[dtype](onnx_graph.policy(stored.agent, stored.params, _labels(stored)))
     (folder / "policy.onnx").write_bytes(model.SerializeToString())
     contents: dict[str, Any] = arrays(stored.agent, stored.statistics)
     np.savez_compressed(folder / "arrays.npz", **contents)
@@ -73,7 +83,8 @@ def fill(folder: Path, stored: Stored, recorded: dict[str, Any], provenance: Map
     for name in CODE:
         shutil.copyfile(Path(__file__).parent / name, folder / name)
     digests = {file.name: digest(file) for file in sorted(folder.iterdir())}
-    text = json.dumps(facts(stored) | {"provenance": provenance, "files": digests}, indent=1)
+    more = {"dtype": dtype, "check": CHECKS[dtype], "provenance": provenance, "files": digests}
+    text = json.dumps(facts(stored) | more, indent=1)
     (folder / FACTS).write_text(text + "\n", encoding="utf-8")
 
 
