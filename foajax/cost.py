@@ -6,6 +6,9 @@ already; no game is started. FLOPs are XLA's count of the program *before* it is
 depend on neither the device nor what XLA fuses; but a loop counts as one turn, and thus the sensor's
 repair of an area that overhangs the frame counts even where none does. Times are medians of repeats
 that take turns, so that whatever else the machine does slows all experiments alike.
+
+`target=onnx` times the folders that `foajax.export` writes, from a screen and from a camera's image to the next focal
+point, on one thread (extra `robot`).
 """
 
 from __future__ import annotations
@@ -50,6 +53,8 @@ class Options:
     torso: Literal["nature", "a3c"] = "nature"  # the group network/
     json: str | None = None  # file for the result
     repeats: int = 50
+    target: Literal["jax", "onnx"] = "jax"
+    dtype: Literal["float32", "float16", "int8"] = "float32"  # of the weights, where target=onnx
 
     def __post_init__(self) -> None:
         if self.repeats < 1:
@@ -88,6 +93,29 @@ def measure_decisions(configs: Sequence[Config], *, repeats: int) -> list[dict[s
     subjects, key = [_subject(config) for config in configs], "decision_us_batch1"
     times = _time([{key: subject.calls[key]} for subject in subjects], repeats)
     return [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
+
+
+def measure_exported(experiments: Sequence[str], *, torso: str, dtype: str, repeats: int) -> list[dict[str, Any]]:
+    """One record an experiment, and `nonfoa`: what `robot.latency.measure` finds, and estimates of energy.
+
+    Raises:
+      ConfigError: an unknown name; the extra `robot` is not installed.
+    """
+    try:
+        from foajax.robot import latency
+    except ImportError as error:
+        raise ConfigError(f"target=onnx: {error.name} is missing; accepted is foajax[robot]") from None
+    names = list(dict.fromkeys([*experiments, _REFERENCE]))
+    configs = [compose([f"experiment={name}", f"network={torso}"]) for name in names]
+    records = latency.measure(configs, dtype=dtype, repeats=repeats)
+    reference = records[names.index(_REFERENCE)]
+    for name, config, record in zip(names, configs, records, strict=True):
+        record["experiment"], record["dtype"] = name, dtype
+        record["decision_flops"] = count = _subject(config).exact["decision_flops"]
+        for source, size in (("screen", 210 * 160), ("camera", 1080 * 1920 * 3)):
+            record[f"{source}_ratio"] = record[f"{source}_us"] / reference[f"{source}_us"]
+            record[f"{source}_energy_estimate_uj"] = 1e6 * latency.energy(count, record["bytes"], size)
+    return records
 
 
 def wait_in_place() -> None:
@@ -223,8 +251,12 @@ def cost(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     wait_in_place()
     names = list_experiments() if options.experiments is None else options.experiments.split(",")
-    records = measure(names, torso=options.torso, repeats=options.repeats)
-    _print(records)
+    if options.target == "onnx":
+        records = measure_exported(names, torso=options.torso, dtype=options.dtype, repeats=options.repeats)
+        _print_exported(records)
+    else:
+        records = measure(names, torso=options.torso, repeats=options.repeats)
+        _print(records)
     if options.json:
         cli.write_json("json", options.json, records)
 
@@ -256,6 +288,30 @@ def _print(records: Sequence[dict[str, Any]]) -> None:
     console.print(table)
     device = f"{jax.devices()[0].device_kind}, host {platform.machine()} with {os.cpu_count()} cores"
     console.print(f"Ratios are to {_REFERENCE}. {device}, jax {jax.__version__}.")
+
+
+def _print_exported(records: Sequence[dict[str, Any]]) -> None:
+    table = Table(box=box.SIMPLE, title=f"ONNX Runtime, {records[0]['dtype']}; us, median | 99%")
+    headings = ("frame", "sense", "torso", "network", "screen", "camera", "JAX, screen")
+    for heading in ("experiment", *headings, "ratio", "MB", "memory MB", "start s", "energy est. uJ"):
+        table.add_column(heading, no_wrap=True, justify="left" if heading == "experiment" else "right")
+    for record in records:
+        parts = ("frame", "sense", "torso", "network", "screen", "camera", "jax_screen")
+        table.add_row(
+            record["experiment"],
+            *(f"{record[f'{part}_us']:,.0f} | {record[f'{part}_us_p99']:,.0f}" for part in parts),
+            f"{record['screen_ratio']:.2f}",
+            f"{record['bytes'] / 1e6:.1f}",
+            f"{record['memory_mb']:.0f}",
+            f"{record['start_s']:.2f}",
+            f"{record['screen_energy_estimate_uj']:.0f}",
+        )
+    console = Console(width=170, highlight=False)
+    console.print(table)
+    console.print(
+        "frame, sense and network make up screen, a whole decision; torso is a part of network. Energy is an estimate "
+        "from operations and bytes read."
+    )
 
 
 if __name__ == "__main__":

@@ -152,13 +152,14 @@ class Sensor:
             frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3))
         arrays, sensor = self._arrays, self._sensor
         top, left = focal_point - self._window // 2
-        window = (self._cut(frame, top, left) - self._cut(arrays["mean"], top, left)) / arrays["std"]
+        window = self._cut(frame, top, left) - self._cut(arrays["mean"], top, left)
         if sensor["kind"] == "logpolar":
-            values = np.add.reduceat(window.ravel()[arrays["pixel"]] * arrays["share"], arrays["first"])
+            values = np.add.reduceat(window.ravel()[arrays["pixel"]] * arrays["weight"], arrays["first"])
             return [values.reshape(sensor["rings"], sensor["wedges"])]
-        images = [self._pool(window, *ring) * arrays[f"visible_{i}"] for i, ring in enumerate(sensor["rings"])]
+        # A weight divides by the number of pixels and by the deviation; it is 0 where a finer ring lies.
+        images = [self._sums(window, *ring) * arrays[f"weight_{i}"] for i, ring in enumerate(sensor["rings"])]
         if sensor["peripheral"]:
-            cells = self._cells((frame - arrays["mean"]) / arrays["std"])
+            cells = (self._cells(frame) - arrays["mean_cells"]) * arrays["cell_weight"]
             edges = (arrays["row_edges"], top), (arrays["column_edges"], left)
             rows, columns = ((e[:-1] >= at) & (e[1:] <= at + n) for (e, at), n in zip(edges, self._window, strict=True))
             images.append(cells * ~(rows[:, None] & columns))
@@ -175,29 +176,26 @@ class Sensor:
         area[y - top : y - top + part.shape[0], x - left : x - left + part.shape[1]] = part
         return area
 
-    def _pool(self, window: np.ndarray, height: int, width: int, factor: int) -> np.ndarray:
-        """The mean of each block of a ring, or its first pixel; the last blocks may be smaller."""
+    def _sums(self, window: np.ndarray, height: int, width: int, factor: int) -> np.ndarray:
+        """The sum of each block of a ring, or its first pixel; the last blocks may be smaller."""
         top, left = self._window // 2 - (height // 2, width // 2)
         area = window[top : top + height, left : left + width]
         if factor == 1 or self._sensor["pooling"] == "stride":
             return area[::factor, ::factor]
-        sums = _block_sums(_block_sums(area, factor).T, factor).T
-        rows, columns = (np.minimum(factor, size - np.arange(0, size, factor)) for size in (height, width))
-        return sums / np.outer(rows, columns).astype(np.float32)
+        return _block_sums(_block_sums(area, factor).T, factor).T
 
     def _cells(self, image: np.ndarray) -> np.ndarray:
-        """The peripheral grid: the whole frame, coarse."""
-        rows, columns = self._arrays["row_edges"], self._arrays["column_edges"]
+        """The peripheral grid, the whole frame in coarse cells: the sum of each, or its first pixel."""
+        rows, columns = self._arrays["row_edges"][:-1], self._arrays["column_edges"][:-1]
         if self._sensor["pooling"] == "stride":
-            return image[rows[:-1]][:, columns[:-1]]
-        sums = np.add.reduceat(np.add.reduceat(image, rows[:-1], 0), columns[:-1], 1)
-        return sums / np.outer(np.diff(rows), np.diff(columns)).astype(np.float32)
+            return image[rows][:, columns]
+        return np.add.reduceat(np.add.reduceat(image, rows, 0), columns, 1)
 
     def _canvas(self, images: list[np.ndarray], top: int, left: int) -> np.ndarray:
         """Every value painted over the pixels that it stands for, on an image of the frame's size."""
         values = np.concatenate([*(image.ravel() for image in images), np.zeros(1, np.float32)])
-        canvas = values[self._arrays["paint_background"]]
-        y, x, area = max(top, 0), max(left, 0), values[self._arrays["paint_window"]]
+        canvas = values.take(self._arrays["paint_background"])
+        y, x, area = max(top, 0), max(left, 0), values.take(self._arrays["paint_window"])
         room = canvas[y : top + len(area), x : left + area.shape[1]]
         room[:] = area[y - top : y - top + room.shape[0], x - left : x - left + room.shape[1]]
         return canvas

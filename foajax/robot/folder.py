@@ -165,24 +165,33 @@ def _gaze(config: Config) -> dict[str, Any]:
 
 
 def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
-    """The normalisation, bias-corrected, and what the sensor's arithmetic is made of."""
+    """What the sensor's arithmetic is made of: the mean frame, and weights that divide by the deviation.
+
+    Sensing is linear: what it gives of a normalised frame is what it gives of the difference from the mean, weighted.
+    """
     sensor, shape = agent.config.sensor, agent.config.env.frame_shape
-    mean, std = np.zeros(shape, np.float32), np.float32(1)
+    mean, std = np.zeros(shape, np.float32), 1.0
     if _normalisation(agent, statistics) in ("running", "pixel"):
         mean = np.array(np.broadcast_to(np.asarray(statistics.mean / statistics.weight), shape))
-        std = np.maximum(np.asarray(statistics.std / statistics.weight), np.float32(SMALLEST_STD))
-    found: dict[str, Any] = {"mean": mean, "std": std}
+        std = max(float(statistics.std / statistics.weight), SMALLEST_STD)
+    found: dict[str, Any] = {"mean": mean}
     if isinstance(sensor, LogPolarSensor):
         cell, pixel, share = logpolar.shares(sensor)
         first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
-        return found | {"pixel": pixel.astype(np.int32), "share": share.astype(np.float32), "first": first}
+        return found | {"pixel": pixel, "weight": (share / std).astype(np.float32), "first": first}
     # A frame of ones shows which blocks a finer ring hides.
     seen = sense(jnp.ones(shape), jnp.array(shape) // 2, sensor=packed(sensor))
-    for i in range(len(sensor.rings)):
-        found[f"visible_{i}"] = np.asarray(seen[i][..., 0] > 0, np.float32)
+    by_mean = sensor.pooling == "mean"
+    for i, (height, width, factor) in enumerate(sensor.rings):
+        pixels = np.outer(*(np.minimum(factor, size - np.arange(0, size, factor)) for size in (height, width)))
+        visible = np.asarray(seen[i][..., 0] > 0)
+        found[f"weight_{i}"] = (visible / std / (pixels if by_mean else 1)).astype(np.float32)
     if sensor.peripheral is not None:
         rows, columns = (np.arange(n + 1) * size // n for n, size in zip(sensor.peripheral, shape, strict=True))
-        found |= {"row_edges": rows, "column_edges": columns}
+        pixels = np.outer(np.diff(rows), np.diff(columns)) if by_mean else np.ones(sensor.peripheral)
+        sums = np.add.reduceat(np.add.reduceat(mean, rows[:-1], 0), columns[:-1], 1)
+        found |= {"row_edges": rows, "column_edges": columns, "cell_weight": (1 / std / pixels).astype(np.float32)}
+        found["mean_cells"] = sums if by_mean else mean[rows[:-1]][:, columns[:-1]]
     if sensor.layout == "canvas":
         painting = tables(packed(sensor), shape)
         found |= {"paint_window": painting.window, "paint_background": painting.background}
