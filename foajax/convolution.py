@@ -37,7 +37,8 @@ def convolve(
         )
     if x.shape[3] != kernel.shape[2]:
         raise ValueError(f"image of {x.shape[3]} channels: the kernel takes {kernel.shape[2]}")
-    if jax.default_backend() == "cpu" and x.shape[0] >= _MANY_IMAGES:
+    # A batch of any size, for which jax.export traces, is no integer.
+    if jax.default_backend() == "cpu" and isinstance(x.shape[0], int) and x.shape[0] >= _MANY_IMAGES:
         return _convolve_cpu(x, kernel, stride)
     return convolve_plain(x, kernel, stride)
 

@@ -26,6 +26,7 @@ class Options:
     out: str  # the folder
     checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
     dtype: Literal["float32", "float16", "int8"] = "float32"  # of the weights; float16 halves the file, int8 is faster
+    stablehlo: bool = False  # write the whole decision as a program for JAX too
 
 
 def export(arguments: Sequence[str]) -> None:
@@ -40,7 +41,14 @@ def export(arguments: Sequence[str]) -> None:
 
     stored = load_agent(options.run, best=options.checkpoint == "best")
     words = ["python", "-m", "foajax.export", *arguments]
-    found = folder.write(stored, Path(options.out), source=options.run, dtype=options.dtype, command=words)
+    found = folder.write(
+        stored,
+        Path(options.out),
+        source=options.run,
+        dtype=options.dtype,
+        with_stablehlo=options.stablehlo,
+        command=words,
+    )
     size = sum(file.stat().st_size for file in Path(options.out).iterdir())
     print(f"{options.out}: {size / 1e6:.1f} MB; {found}")
 

@@ -22,7 +22,7 @@ from foajax.config import Config, ConfigError, LogPolarSensor, to_mapping
 from foajax.foveation import sense
 from foajax.frames import SMALLEST_STD
 from foajax.painting import packed, tables
-from foajax.robot import golden, onnx_graph, smaller
+from foajax.robot import golden, onnx_graph, smaller, stablehlo
 from foajax.store import Stored, load_score
 from foajax.types import FrameStatistics
 
@@ -39,7 +39,15 @@ CODE = ("agent.py", "check.py", "camera.py", "node.py")  # copied as they are
 _TIMEOUT = 600.0  # seconds that the check may take
 
 
-def write(stored: Stored, out: Path, *, source: str, dtype: str = "float32", command: Sequence[str] = ()) -> str:
+def write(
+    stored: Stored,
+    out: Path,
+    *,
+    source: str,
+    dtype: str = "float32",
+    with_stablehlo: bool = False,
+    command: Sequence[str] = (),
+) -> str:
     """Writes an agent to `out`, once the folder's own check has passed; gives what the check says.
 
     Args:
@@ -47,7 +55,8 @@ def write(stored: Stored, out: Path, *, source: str, dtype: str = "float32", com
       out: a new directory, or one that an earlier export has written.
       source: the run or agent that it was read from, for the record.
       dtype: what the network's weights are stored in, one of `CHECKS`.
-      command: likewise.
+      with_stablehlo: whether the whole decision is written too, as a program for JAX.
+      command: as it was typed, likewise for the record.
 
     Raises:
       ConfigError: `out` is something else or cannot be written; the network has a part that cannot be exported; the
@@ -62,6 +71,10 @@ def write(stored: Stored, out: Path, *, source: str, dtype: str = "float32", com
             folder = Path(made) / out.name
             fill(folder, stored, recorded, provenance, dtype)
             found = run_check(folder)
+            if with_stablehlo:
+                program = stablehlo.serialise(stored)
+                found += f"; {stablehlo.FILE}: logits within {stablehlo.check(program, recorded, stored.agent):.1e}"
+                (folder / stablehlo.FILE).write_bytes(program)
             out.mkdir(exist_ok=True)
             for name in sorted(file.name for file in folder.iterdir() if file.is_file()):
                 (folder / name).replace(out / name)  # what else lies there is the user's

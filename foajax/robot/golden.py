@@ -11,7 +11,7 @@ from foajax import evaluate
 from foajax.gymnasium_env import gray_frames
 from foajax.store import Stored
 
-STEPS, _GAMES = 200, 2  # a second game begins half way, with memory and gaze reset
+STEPS, GAMES = 200, 2  # a second game begins half way, with memory and gaze reset
 _BLOCK = 5  # pixels of one colour in the images: noise would fill the folder
 
 
@@ -24,12 +24,12 @@ def record(stored: Stored, *, seed: int = 0) -> dict[str, np.ndarray]:
     Raises:
       ConfigError: the game cannot be played here.
     """
-    environment = evaluate.environment(stored, num_envs=_GAMES, seed=seed)
+    environment = evaluate.environment(stored, num_envs=GAMES, seed=seed)
     act = jax.jit(functools.partial(stored.agent.act, greedy=True))
-    state, key = stored.agent.initial_state(_GAMES), jax.random.key(seed)
+    state, key = stored.agent.initial_state(GAMES), jax.random.key(seed)
     rows: dict[str, list[np.ndarray]] = {}
     timestep, _ = environment.reset()
-    for step in range(STEPS // _GAMES):
+    for step in range(STEPS // GAMES):
         now = jax.random.fold_in(key, step)
         output, network, state = act(stored.params, stored.statistics, state, timestep, now)
         row = {name: getattr(timestep, name) for name in ("frame", "reward", "is_first")}

@@ -72,7 +72,7 @@ def measure(configs: Sequence[Config], *, dtype: str, repeats: int) -> list[dict
     return records
 
 
-def energy(flops: float, weight_bytes: float, image_bytes: float) -> float:
+def energy(flops: int, weight_bytes: int, image_bytes: int) -> float:
     """An estimate, in joules: every operation, and every byte of weights and image read from memory once."""
     return flops * _JOULES_PER_FLOP + (weight_bytes + image_bytes) * _JOULES_PER_BYTE
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -210,3 +211,13 @@ def test_statistics_that_have_seen_nothing_are_the_frames_own(untrained):
     arrays = folder.arrays(stored.agent, stored.statistics)
     assert not arrays["mean"].any()
     assert (arrays["weight_0"] == 1).all()
+
+
+def test_the_page_shows_a_program_that_runs(exported, monkeypatch):
+    page = (ROOT / "docs" / "robot.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(exported.parent)
+    names = {"frame": np.zeros((210, 160), np.uint8)}
+    exec(block, names)
+    assert names["agent"].age == 0
+    assert names["natural"] in range(6)

@@ -89,3 +89,36 @@ def test_another_core_is_refused():
 
     with pytest.raises(ConfigError, match="network.core=attention: accepted by export are lstm"):
         onnx_graph.core(Other())
+
+
+def test_16_bits_halve_the_file_and_change_little(make_stored):
+    stored = make_stored("experiment=constant70_p_packed", "network.dense=128", "network.lstm=128")
+    model = onnx_graph.policy(stored.agent, stored.params, {})
+    small = pytest.importorskip("foajax.robot.smaller").float16(model)
+    assert small.ByteSize() < 0.6 * model.ByteSize()
+    outputs = compare(model, small)
+    assert 0 < max(outputs.values()) < 0.01
+
+
+def test_8_bits_quantise_every_matrix_product(make_stored):
+    stored = make_stored("experiment=constant70_p_packed", "network.dense=128", "network.lstm=128")
+    model = onnx_graph.policy(stored.agent, stored.params, {"game": "breakout"})
+    small = pytest.importorskip("foajax.robot.smaller").int8(model)
+    assert small.ByteSize() < 0.5 * model.ByteSize()
+    kinds = [node.op_type for node in small.graph.node]
+    assert "MatMulInteger" in kinds
+    assert not {"MatMul", "Gemm"} & set(kinds)
+    assert {"game": "breakout"}.items() <= {p.key: p.value for p in small.metadata_props}.items()
+    outputs = compare(model, small)
+    assert 0 < max(outputs.values()) < 0.3
+
+
+def compare(*models):
+    """The largest difference of each output of two networks."""
+    found = []
+    for model in models:
+        session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+        random = np.random.default_rng(0)
+        feed = {i.name: random.normal(size=(2, *i.shape[1:])).astype(np.float32) for i in session.get_inputs()}
+        found.append(dict(zip([o.name for o in session.get_outputs()], session.run(None, feed), strict=True)))
+    return {name: float(np.abs(value - found[1][name]).max()) for name, value in found[0].items()}
