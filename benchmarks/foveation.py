@@ -9,7 +9,6 @@ machine. Run it on an idle one.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
 import platform
@@ -21,18 +20,20 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
-from foajax import cli, cost
-from foajax.compose import compose
-from foajax.config import LogPolarSensor, RingSensor, Sensor
-from foajax.foveation import sense
-from foajax.show import PAPER
+from foajax import cli, runtime
+from foajax.config.compose import compose
+from foajax.config.parse import Section
+from foajax.config.schema import LogPolarSensor, RingSensor, SensorConfig
+from foajax.sensors.sense import sense
+from foajax.viewing.sheet import PAPER
 
 TABLE_II = {name: compose([f"experiment={name}"]).sensor for name in PAPER}
 CONSTANT70_PACKED = RingSensor(((70, 70, 2),), layout="packed")
 
 
-def sensors() -> dict[str, Sensor]:
+def sensors() -> dict[str, SensorConfig]:
     """Every sensor of Table II on the canvas and packed, and the log-polar ones."""
     packed = {
         f"{name} packed": RingSensor(s.rings, peripheral=s.peripheral, layout="packed") for name, s in TABLE_II.items()
@@ -61,7 +62,7 @@ def batch(size: int, shape: tuple[int, int] = (80, 80)) -> tuple[np.ndarray, np.
     return rng.normal(size=(size, *shape)).astype(np.float32), rng.integers(35, 46, (size, 2)).astype(np.int32)
 
 
-def sensing(sensor: Sensor, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
+def sensing(sensor: SensorConfig, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
     """A compiled call on arrays in the device's memory; vmapped where there is a batch."""
     run = functools.partial(sense, sensor=sensor, bounds="window")
     compiled = jax.jit(jax.vmap(run) if frames.ndim == 3 else run)
@@ -115,20 +116,19 @@ def against_opencv() -> dict[str, float] | None:
     return {"foajax": sensed, "opencv": looped, "speedup": looped / sensed}
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    out: str | None = None
+    out: str | None = Field(None, description="File for the result.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 
 def main(arguments: Sequence[str]) -> None:
     """Runs all three and writes JSON where `out=<file>` says so."""
     options = cli.parse(Options, arguments)
-    cost.wait_in_place()
+    runtime.wait_in_place()
     results: dict[str, object] = {
         "device": jax.devices()[0].device_kind,
         "cpus": os.cpu_count(),

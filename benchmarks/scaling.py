@@ -36,32 +36,34 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from foajax import cli, envs
-from foajax.compose import compose
-from foajax.config import ConfigError
+from pydantic import Field
+
+from foajax import cli
+from foajax.config.compose import compose
+from foajax.config.parse import ConfigError, Section, to_mapping
+from foajax.envs.make import make
 
 SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32
 DEVICES = (2, 4, 8)
 MINIBATCHES = 4
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    part: Literal["all", "weak", "allreduce", "model", "member"] = "all"  # member: one process of `allreduce`
-    game: str = "pong"
-    experiment: str = "constant70_packed"
-    envs: int = 16  # of each process
-    seconds: float = 20.0  # that a speed is measured over
-    out: str | None = None
-    devices: int = 1
-    coordinator: str = ""
-    process: int = 0
+    part: Literal["all", "weak", "allreduce", "model", "member"] = Field(
+        "all", description="What to measure; member is one process of allreduce."
+    )
+    game: str = Field("pong", description="The game.")
+    experiment: str = Field("constant70_packed", description="The experiment.")
+    envs: int = Field(16, ge=1, multiple_of=MINIBATCHES, description="Environments of each process.")
+    seconds: float = Field(20.0, description="Seconds that a speed is measured over.")
+    out: str | None = Field(None, description="File for the result.")
+    devices: int = Field(1, description="For part=member: how many processes there are.")
+    coordinator: str = Field("", description="For part=member: address of the first one.")
+    process: int = Field(0, description="For part=member: number of this one.")
 
-    def __post_init__(self) -> None:
-        if self.envs < 1 or self.envs % MINIBATCHES:
-            raise ConfigError(f"envs={self.envs}: accepted is a multiple of {MINIBATCHES}")
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 
@@ -110,7 +112,7 @@ def free_address() -> str:
 def training(options: Options, run: Path, processes: int, process: int, address: str) -> list[str]:
     """The words of one process of a run: equal work for each process, whatever their number."""
     words = [f"game={options.game}", f"experiment={options.experiment}", f"run={run}", "env.threads=1"]
-    words += [f"env.num_envs={options.envs * processes}", "learner=a2c", f"learner.minibatches={MINIBATCHES}"]
+    words += [f"env.num_envs={options.envs * processes}", "learner=a2c", f"learner.num_minibatches={MINIBATCHES}"]
     words += ["train.log_every=0.5", "train.env_steps=100000000", "train.checkpoint_every=1000"]
     if processes > 1:
         shared = {"coordinator": address, "processes": processes, "process": process}
@@ -145,7 +147,7 @@ def weak(options: Options, cores: Sequence[int]) -> dict[str, Any]:
     """Speeds of one process, of two that share a run, and of two runs at a time."""
     # What training would refuse is said once, and here.
     config = compose(training(options, Path("run"), 1, 0, ""))
-    envs.make(config, num_envs=1, seed=0).close()
+    make(config, num_envs=1, seed=0).close()
     with tempfile.TemporaryDirectory() as temporary:
         directory = Path(temporary)
 
@@ -282,7 +284,7 @@ def main(arguments: Sequence[str]) -> None:
         "jax": jaxlib.__version__,
         "cores": len(pinnable()) or os.cpu_count(),
     }
-    result: dict[str, Any] = {"options": dataclasses.asdict(options), **versions}
+    result: dict[str, Any] = {"options": to_mapping(options), **versions}
     cores = pinnable()[:2]
     if len(cores) < 2 and options.part != "model":
         print("left out: weak and allreduce, which need two cores to pin processes to", file=sys.stderr)

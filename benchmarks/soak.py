@@ -11,7 +11,6 @@ more open files or threads than at the beginning. Linux only; run it on an other
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import platform
@@ -26,23 +25,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError, Section
 
 _EVERY = 1.0  # seconds between two looks
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes besides the keys of a run."""
 
-    minutes: float = 30.0
-    out: str | None = None
-    run: str | None = None  # directory; null for a temporary one
+    minutes: float = Field(30.0, ge=2, description="How long to watch.")
+    out: str | None = Field(None, description="File for the result.")
+    run: str | None = Field(None, description="Directory of the run; null for a temporary one.")
 
-    def __post_init__(self) -> None:
-        if self.minutes < 2:
-            raise ConfigError(f"minutes={self.minutes:g}: accepted is a number >= 2")
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 
@@ -136,7 +134,7 @@ def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample]
 
 def main(words: Sequence[str]) -> int:
     """The command."""
-    keys = [field.name for field in dataclasses.fields(Options)]
+    keys = Options.model_fields
     ours = [word for word in words if word.partition("=")[0] in keys]
     options = cli.parse(Options, ours)
     seconds = 60 * options.minutes

@@ -5,14 +5,13 @@
 For each experiment, in a process of its own: the environments alone under random actions, `act` alone, `update`
 alone, and the training loop, in turns of a few seconds, `repeats` times over. Printed and written are medians of
 steps/s; `ratio` is the median of end to end / env-only, each of one turn, so that both saw the same machine.
-`core_us` is processor time a step, summed over all cores. Further words (`learner.epochs=2`) go to the
+`core_us` is processor time a step, summed over all cores. Further words (`learner.num_epochs=2`) go to the
 configuration. Run it on an idle machine.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import multiprocessing
 import os
 import platform
@@ -28,40 +27,39 @@ from typing import Any
 
 import jax
 import numpy as np
+from pydantic import Field
 from rich.console import Console
 from rich.table import Table
 
 from foajax import cli
-from foajax.agent import Agent
-from foajax.allocator import keep_memory
-from foajax.compose import compose
-from foajax.config import Config, ConfigError
-from foajax.programs import make_programs, make_state, use_compilation_cache
-from foajax.rollout import Collector, update_on
-from foajax.train import make_environments
+from foajax.config.compose import compose
+from foajax.config.parse import Section
+from foajax.config.schema import Config
+from foajax.envs.make import make_environments
+from foajax.learning.agent import Agent
+from foajax.learning.programs import make_programs, make_state
+from foajax.runtime import keep_memory, use_compilation_cache
+from foajax.training.collector import Collector, update_on
 
 PARTS = ("env_only", "act_only", "update_only", "end_to_end")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes beside keys of the configuration."""
 
-    experiments: str = "nonfoa,constant70,constant70_packed,constant70_p_packed,decreasing_packed,logpolar"
-    torso: str = "nature"  # of the group network/
-    learner: str = "a2c"  # one pass over each step, as the codes that speeds are compared with
-    num_envs: int = 32
-    repeats: int = 5
-    seconds: float = 3.0  # a turn of one part
-    startup: bool = True  # also time a whole process up to its first update
-    out: str | None = None
+    experiments: str = Field(
+        "nonfoa,constant70,constant70_packed,constant70_p_packed,decreasing_packed,logpolar",
+        description="Names with commas between them.",
+    )
+    torso: str = Field("nature", description="Choice of the group network/.")
+    learner: str = Field("a2c", description="Choice of the group learner/: one pass over each step, as others' codes.")
+    num_envs: int = Field(32, ge=1, description="Environments.")
+    repeats: int = Field(5, ge=1, description="Turns of each part.")
+    seconds: float = Field(3.0, gt=0, description="Seconds per turn of one part.")
+    startup: bool = Field(True, description="Also time a whole process up to its first update.")
+    out: str | None = Field(None, description="File for the result.")
 
-    def __post_init__(self) -> None:
-        for key in ("num_envs", "repeats"):
-            if getattr(self, key) < 1:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 1")
-        if self.seconds <= 0:
-            raise ConfigError(f"seconds={self.seconds}: accepted is a number > 0")
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 
@@ -145,7 +143,7 @@ def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
         "torso": config.network.torso,
         "learner": options.learner,
         "num_envs": config.env.num_envs,
-        "groups": config.env.groups,
+        "groups": config.env.num_groups,
     }
     record |= {part: statistics.median(speed for speed, _ in turns[part]) for part in PARTS}
     ratios = [whole / env for (whole, _), (env, _) in zip(turns["end_to_end"], turns["env_only"], strict=True)]
@@ -179,7 +177,7 @@ def startup(words: Sequence[str], config: Config) -> float:
 
 def main(arguments: Sequence[str]) -> None:
     """Measures every experiment, prints the table, writes JSON."""
-    keys = {field.name for field in dataclasses.fields(Options)}
+    keys = Options.model_fields.keys()
     options = cli.parse(Options, [word for word in arguments if word.partition("=")[0] in keys])
     more = [word for word in arguments if word.partition("=")[0] not in keys]
     runs = []  # all composed before the first is measured: a mistake in the last one would lose the others

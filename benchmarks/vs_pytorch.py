@@ -11,7 +11,6 @@ foajax itself does not use. Run it on an idle machine.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import platform
 import statistics
@@ -24,14 +23,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 from foajax import cli
-from foajax.agent import Agent
-from foajax.allocator import keep_memory
-from foajax.compose import compose
-from foajax.config import Config, ConfigError, NetworkConfig
-from foajax.foveation import image_shapes
-from foajax.optimizer import make_optimizer
+from foajax.config.compose import compose
+from foajax.config.parse import Section
+from foajax.config.schema import Config, NetworkConfig
+from foajax.learning.agent import Agent
+from foajax.learning.optimizer import make_optimizer
+from foajax.runtime import keep_memory
 from foajax.types import CoreState, NetworkOutput
 
 STEPS = 21  # T + 1
@@ -39,25 +39,21 @@ ACTIONS = 4
 PARTS = ("forward", "forward_backward", "update", "update_fused")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    experiments: str = "nonfoa,constant70_packed"
-    torso: str = "nature"  # of the group network/
-    num_envs: int = 4  # of a minibatch
-    repeats: int = 40
-    out: str | None = None
+    experiments: str = Field("nonfoa,constant70_packed", description="Names with commas between them.")
+    torso: str = Field("nature", description="Choice of the group network/.")
+    num_envs: int = Field(4, ge=1, description="Environments of a minibatch.")
+    repeats: int = Field(40, ge=5, description="Repeats of each timing.")
+    out: str | None = Field(None, description="File for the result.")
 
-    def __post_init__(self) -> None:
-        for key, least in (("num_envs", 1), ("repeats", 5)):
-            if getattr(self, key) < least:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= {least}")
+    def check(self) -> None:
         cli.check_file("out", self.out)
 
 
 def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]:
-    """The network of `foajax.networks` in PyTorch's own operations, and its parameters as leaves."""
+    """The network of `foajax.networks.network` in PyTorch's own operations, and its parameters as leaves."""
     import torch
     import torch.nn.functional as F
 
@@ -145,10 +141,10 @@ class Inputs(NamedTuple):
     is_first: np.ndarray  # [T+1, B]
 
     @classmethod
-    def make(cls, config: Config, batch: int) -> Inputs:
+    def make(cls, agent: Agent, batch: int) -> Inputs:
         """Noise."""
         random = np.random.default_rng(0)
-        shapes = image_shapes(config.sensor, config.env.frame_shape)
+        shapes = agent.image_shapes
         return cls(
             roi=[random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in shapes],
             focal_point=random.uniform(-1, 1, (STEPS, batch, 2)).astype(np.float32),
@@ -229,7 +225,7 @@ def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
     """One experiment on both sides."""
     agent = Agent(config, ACTIONS, None)
     params = agent.initial_params(jax.random.key(0))
-    inputs = Inputs.make(config, options.num_envs)
+    inputs = Inputs.make(agent, options.num_envs)
     sides = our_calls(agent, params, inputs), their_calls(agent, params, inputs)
     for mine, other in zip(*(calls["forward"]() for calls in sides), strict=True):
         np.testing.assert_allclose(mine, other.numpy(), atol=2e-4)

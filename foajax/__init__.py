@@ -12,33 +12,44 @@ __all__ = [
     "ConfigError",
     "FoveatedObservation",
     "FoveatedVectorObservation",
+    "GazeConfig",
     "LogPolarSensor",
     "RingSensor",
+    "Sensor",
+    "TrainedAgent",
+    "compose",
     "load_agent",
+    "picture",
     "sense",
+    "train_agent",
 ]
 
 if TYPE_CHECKING:
-    from foajax.agent import Agent
-    from foajax.config import Config, ConfigError, LogPolarSensor, RingSensor
-    from foajax.foveation import sense
-    from foajax.store import load_agent
-    from foajax.wrapper import FoveatedObservation, FoveatedVectorObservation
+    from foajax.config.compose import compose
+    from foajax.config.parse import ConfigError
+    from foajax.config.schema import Config, GazeConfig, LogPolarSensor, RingSensor
+    from foajax.learning.agent import Agent
+    from foajax.runs.agents import TrainedAgent, load_agent
+    from foajax.sensors.base import Sensor
+    from foajax.sensors.compiled import picture, sense
+    from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
+    from foajax.training.start import train_agent
 else:
     _HOMES = {
-        "Agent": "agent",
-        "Config": "config",
-        "ConfigError": "config",
-        "LogPolarSensor": "config",
-        "RingSensor": "config",
-        "FoveatedObservation": "wrapper",
-        "FoveatedVectorObservation": "wrapper",
-        "load_agent": "store",
-        "sense": "foveation",
+        "config.compose": ["compose"],
+        "config.parse": ["ConfigError"],
+        "config.schema": ["Config", "GazeConfig", "LogPolarSensor", "RingSensor"],
+        "learning.agent": ["Agent"],
+        "runs.agents": ["TrainedAgent", "load_agent"],
+        "sensors.base": ["Sensor"],
+        "sensors.compiled": ["picture", "sense"],
+        "sensors.wrappers": ["FoveatedObservation", "FoveatedVectorObservation"],
+        "training.start": ["train_agent"],
     }
 
     def __getattr__(name: str) -> Any:
         """Fetches a public name on first use, so that `import foajax` does not wait for JAX."""
-        if name not in _HOMES:
-            raise AttributeError(f"module 'foajax' has no attribute '{name}'")
-        return getattr(importlib.import_module(f"foajax.{_HOMES[name]}"), name)
+        for home, names in _HOMES.items():
+            if name in names:
+                return getattr(importlib.import_module(f"foajax.{home}"), name)
+        raise AttributeError(f"module 'foajax' has no attribute '{name}'")

@@ -1,33 +1,31 @@
-"""Command lines of the form `key=value`, checked against a dataclass. Standard library and YAML only."""
+"""Command lines of the form `key=value`, checked against a section of keys."""
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import inspect
 import json
 import os
 import sys
-import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
 
-from foajax.config import ConfigError, build, describe, to_mapping
+from foajax.config.parse import ConfigError, Section, SectionT, build, refuse, replace, schema_of
+from foajax.config.table import listed
 
-Options = TypeVar("Options")
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it
 _CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.EEXIST)
 
 
-def parse(options: type[Options], arguments: Sequence[str]) -> Options:
+def parse(options: type[SectionT], arguments: Sequence[str]) -> SectionT:
     """Builds `options` from `key=value` words, values read as YAML; raises `ConfigError`."""
-    return build(options, _values(arguments, options, ""), "")
+    return build(options, _values(arguments, options, ""))
 
 
-def override(config: Options, arguments: Sequence[str], prefix: str, keys: Sequence[str]) -> Options:
+def override(config: SectionT, arguments: Sequence[str], prefix: str, keys: Sequence[str]) -> SectionT:
     """`config`, a part of a run's, with the values of `<prefix>.key=value` words for some of its `keys`.
 
     Raises:
@@ -36,28 +34,27 @@ def override(config: Options, arguments: Sequence[str], prefix: str, keys: Seque
     values = _values([word.removeprefix(f"{prefix}.") for word in arguments], type(config), f"{prefix}.")
     for key, value in values.items():
         if key not in keys:
-            raise ConfigError(f"{prefix}.{key}={value}: accepted of {prefix} are {', '.join(keys)}")
-    return build(type(config), to_mapping(config) | values, prefix)
+            raise refuse(f"{prefix}.{key}", value, keys, why="cannot be changed", near=key)
+    return replace(config, **values)
 
 
-def _values(arguments: Sequence[str], cls: Any, prefix: str) -> dict[str, Any]:
+def _values(arguments: Sequence[str], cls: type[Section], prefix: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    hints = typing.get_type_hints(cls)
+    keys = schema_of(cls)["properties"]
     for word in arguments:
         key, separator, text = word.partition("=")
         if not separator:
-            names = ", ".join(prefix + field.name for field in dataclasses.fields(cls))
-            raise ConfigError(f"{prefix}{word}: accepted is key=value with one of {names}")
-        values[key] = _value(prefix + key, text, hints.get(key))
+            raise refuse(f"{prefix}{word}", accepted=f"key=value with one of {', '.join(prefix + key for key in keys)}")
+        values[key] = _value(prefix + key, text, keys.get(key, {}))
     return values
 
 
-def _value(key: str, text: str, hint: Any) -> Any:
+def _value(key: str, text: str, node: Mapping[str, Any]) -> Any:
     """What a word says. YAML reads 010 as 8, 1:30 as 90 and 1e1 as text, so that numbers are Python's."""
-    kinds = set(typing.get_args(hint) or [hint]) - {type(None)}
+    kinds = {each.get("type") for each in node.get("anyOf", [node])} - {"null"}
     if text not in ("", "null"):
-        for kind in (str, int, float):
-            if kinds == {kind}:
+        for name, kind in {"string": str, "integer": int, "number": float}.items():
+            if kinds == {name}:
                 try:
                     return kind(text)
                 except ValueError:
@@ -65,7 +62,7 @@ def _value(key: str, text: str, hint: Any) -> Any:
     try:
         return yaml.safe_load(text or "null")
     except (yaml.YAMLError, ValueError):  # the latter from what looks like a date
-        raise ConfigError(f"{key}={text}: accepted is a YAML value") from None
+        raise refuse(key, text, "a YAML value") from None
 
 
 def check_file(key: str, path: str | None) -> None:
@@ -74,7 +71,7 @@ def check_file(key: str, path: str | None) -> None:
         return
     file = Path(path).absolute()
     if file.is_dir() or not file.parent.is_dir() or not os.access(file if file.exists() else file.parent, os.W_OK):
-        raise ConfigError(f"{key}={path}: accepted is a file, to write, in a directory that exists")
+        raise refuse(key, path, "a file, to write, in a directory that exists")
 
 
 def write_json(key: str, path: str, found: Any) -> None:
@@ -112,10 +109,15 @@ def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str]
 
 
 def _help(module: Any) -> str:
-    hints = typing.get_type_hints(module.Options)
-    lines = [inspect.cleandoc(module.__doc__ or ""), ""]
-    for field in dataclasses.fields(module.Options):
-        value = field.default
-        shown = "required" if value is dataclasses.MISSING else value if isinstance(value, str) else json.dumps(value)
-        lines.append(f"  {field.name}={shown}: {describe(hints[field.name])}")
-    return "\n".join(lines)
+    return f"{inspect.cleandoc(module.__doc__ or '')}\n\n{listed(module.Options)}"
+
+
+def make_directory(out: str | Path) -> Path:
+    """Creates the directory for results; one line where that cannot be."""
+    try:
+        Path(out).mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise refuse("out", out, f"a directory that can be written ({error.strerror})") from None
+    return Path(out)

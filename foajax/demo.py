@@ -5,44 +5,34 @@ The best agent in agents/ for the game, by the score that it was shipped with.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
+from pydantic import Field
+
 from foajax import cli
-from foajax.config import ConfigError
-from foajax.player import write_page
-from foajax.programs import use_compilation_cache
-from foajax.render import make_directory, play, progress_bar
-from foajax.rundir import load_config
-from foajax.store import load_agent, load_score
+from foajax.config.parse import ConfigError, Section, refuse
+from foajax.config.shipped import agents
+from foajax.runs.agents import load_agent, load_score
+from foajax.runs.directory import load_config
+from foajax.runtime import use_compilation_cache
+from foajax.viewing.player_page import write_page
+from foajax.viewing.recording import play, progress_bar
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    game: str | None = None  # null for breakout, else pong, else any that an agent is shipped for
-    out: str = "demo"  # directory of the page
-    seed: int = 0
-    steps: int = 6000  # at most: nearly seven minutes of an Atari game, played in less than one
-    open: bool = False  # whether to show the page in the browser
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ConfigError(f"steps={self.steps}: accepted is an integer >= 1")
-
-
-def agents() -> Path:
-    """agents/: inside the package when installed from a wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    inside = package / "agents"
-    return inside if inside.is_dir() else package.parent / "agents"
+    game: str | None = Field(None, description="Game to play; null for breakout, else pong, else any with an agent.")
+    out: str = Field("demo", description="Directory of the page.")
+    seed: int = Field(0, description="Seed of the game.")
+    steps: int = Field(6000, ge=1, description="Decisions at most; 6,000 are seven minutes of an Atari game.")
+    open: bool = Field(False, description="Show the page in the browser.")
 
 
 def choose(directory: Path, game: str | None) -> Path:
@@ -58,7 +48,7 @@ def choose(directory: Path, game: str | None) -> Path:
         raise ConfigError("demo: no agent is shipped yet; python -m foajax.player run=<dir> shows one of your own")
     asked = game or next((name for name in _FIRST if name in shipped), min(shipped))
     if asked not in shipped:
-        raise ConfigError(f"game={asked}: no agent is shipped for it; accepted is one of {', '.join(shipped)}")
+        raise refuse("game", asked, shipped, why="no agent is shipped for it")
     return max(shipped[asked], key=lambda path: (load_score(path) or {}).get("mean", -math.inf))
 
 
@@ -66,7 +56,7 @@ def demo(arguments: Sequence[str]) -> None:
     """The command; prints the score and the page's path."""
     options = cli.parse(Options, arguments)
     path = choose(agents(), options.game)
-    stored, directory = load_agent(path), make_directory(options.out)
+    stored, directory = load_agent(path), cli.make_directory(options.out)
     use_compilation_cache()
     with progress_bar() as bar:
         recording = next(play(stored, bar, seed=options.seed, greedy=False, max_steps=options.steps))

@@ -1,196 +1,40 @@
 """`python -m foajax.player run=<dir> out=player`: one recorded game as a page to play, scrub and study.
 
-The page is one file and needs nothing else, no network and no server. Screens are palette indices; 60 at a time, each
-XORed with the one before it, go through zlib, which every browser undoes by itself: a step of an Atari game takes
-some hundred bytes, and any step is on the screen some milliseconds after it is asked for. (A video would be smaller
-for games in full motion; a browser cannot show any frame of one at once, nor exactly.)
+The page is one file and needs nothing else, no network and no server.
 """
 
 from __future__ import annotations
 
-import base64
-import dataclasses
-import json
 import sys
-import zlib
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Literal
 
-import numpy as np
-from PIL import Image
+from pydantic import Field
 
-from foajax import cli, durable
-from foajax.config import ConfigError, LogPolarSensor
-from foajax.envs import steps_per_second
-from foajax.foveation import ring_boxes
-from foajax.gaze import NAMES
-from foajax.painting import packed, tables
-from foajax.programs import use_compilation_cache
-from foajax.recording import Recording
-from foajax.render import make_directory, play, progress_bar
-from foajax.store import load_agent
-
-PAGE = "index.html"
-_PART = 60  # steps that are compressed together; what has to be undone to show one of them
-_MOST_PIXELS = 48_000  # of a screen; a larger one than an Atari's is made smaller
-_COLOURS = 256
+from foajax import cli
+from foajax.config.parse import Section
+from foajax.runs.agents import load_agent
+from foajax.runtime import use_compilation_cache
+from foajax.viewing.player_page import write_page
+from foajax.viewing.recording import play, progress_bar
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str  # a run directory or a shipped agent
-    out: str = "player"  # directory of the page
-    policy: Literal["sampled", "greedy"] = "sampled"
-    seed: int = 0
-    steps: int | None = None  # cuts the game after so many decisions; null for the whole game
-
-    def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise ConfigError(f"steps={self.steps}: accepted is null or an integer >= 1")
-
-
-def write_page(recording: Recording, directory: Path) -> Path:
-    """Writes the page of one game; returns its path."""
-    page = (Path(__file__).parent / "player.html").read_text(encoding="utf-8")
-    text = json.dumps(encode(recording), separators=(",", ":")).replace("<", "\\u003c")  # no tag may end the script
-    title = f"{recording.config.name} on {recording.config.game}".replace("<", "")
-    file = directory / PAGE
-    durable.replace(file, page.replace("{{title}}", title).replace("{{recording}}", text).encode())
-    return file
-
-
-def encode(recording: Recording) -> dict[str, Any]:
-    """All of a recording, as the page's script reads it."""
-    config, sensor = recording.config, packed(recording.config.sensor)
-    palette, screens = _screens(recording)
-    values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
-    painting = tables(sensor, config.env.frame_shape)
-    shape, origin = _shrunk(recording), recording.frame_origin
-    scale = shape[0] / recording.screens.shape[0], shape[1] / recording.screens.shape[1]
-    policy = "likeliest actions" if recording.greedy else "sampled actions"
-    return {
-        "title": f"{config.name} on {config.game}",
-        "about": f"{recording.env_steps:,} env_steps of training, {policy}, game {recording.seed}",
-        "steps": len(recording.screens),
-        "steps_per_second": steps_per_second(config),
-        "screen_shape": shape,
-        "frame_shape": config.env.frame_shape,
-        "origin": [origin[0] * scale[0], origin[1] * scale[0], origin[2] * scale[1]],
-        "areas": [box[2:] for box in ring_boxes((0, 0), sensor)],
-        "round": isinstance(sensor, LogPolarSensor),
-        "gaze": config.gaze.mode,
-        "natural_names": recording.actions,
-        "vision_names": NAMES[: config.gaze.actions],
-        "images": [part.shape[1:] for part in recording.images],
-        "count": values.shape[1],
-        "white": max(int(values.max()), 1),
-        "painting": {"window": painting.window.tolist(), "background": painting.background.tolist()},
-        "part": _PART,
-        "palette": palette,
-        "screens": list(screens),
-        "values": [_pack(values[i : i + _PART]) for i in range(0, len(values), _PART)],
-        "columns": _columns(recording),
-    }
-
-
-def _columns(recording: Recording) -> dict[str, tuple[str, str]]:
-    """Type and content of what a step has one or a few numbers of."""
-    columns: dict[str, np.ndarray] = {
-        "focal_point": recording.focal_point.astype(np.int16),
-        "natural_probs": np.round(255 * recording.natural_probs).astype(np.uint8),
-        "natural_value": recording.natural_value.astype(np.float32),
-        "natural_action": recording.natural_action.astype(np.uint16),
-        "vision_action": recording.vision_action.astype(np.uint8),
-        "score": recording.score.astype(np.float32),
-        "is_first": recording.is_first.astype(np.uint8),
-        "life_lost": recording.life_lost.astype(np.uint8),
-    }
-    if recording.vision_probs is not None and recording.vision_value is not None:
-        columns["vision_probs"] = np.round(255 * recording.vision_probs).astype(np.uint8)
-        columns["vision_value"] = recording.vision_value.astype(np.float32)
-    if recording.lives is not None:
-        columns["lives"] = recording.lives.astype(np.uint8)
-    return {name: (values.dtype.name, _pack(values)) for name, values in columns.items()}
-
-
-def _pack(values: np.ndarray) -> str:
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 9)).decode()
-
-
-def _screens(recording: Recording) -> tuple[list[list[int]], Iterator[str]]:
-    """A palette for the whole game, and the screens part by part."""
-    palette = _exact_palette(recording) if _shrunk(recording) == recording.screens.shape[:2] else None
-    if palette is not None:
-        index = np.zeros(1 << 24, np.uint8)
-        index[palette] = np.arange(len(palette))
-        colours = np.stack([palette >> 16, palette >> 8 & 255, palette & 255], axis=-1)
-        return colours.tolist(), _parts(index[_codes(screen)] for screen in recording.screens)
-    reference = _chosen_palette(recording)
-    colours = np.array(reference.getpalette(), int).reshape(-1, 3)
-    images = (_small(recording, i) for i in range(len(recording.screens)))
-    quantized = (image.quantize(palette=reference, dither=Image.Dither.NONE) for image in images)
-    return colours.tolist(), _parts(np.asarray(image) for image in quantized)
-
-
-def _parts(screens: Iterator[np.ndarray]) -> Iterator[str]:
-    """Indices [h, w] of one screen after the other, XORed with the one before, `_PART` at a time."""
-    part: list[np.ndarray] = []
-    for screen in screens:
-        part.append(screen)
-        if len(part) == _PART:
-            yield _pack_part(part)
-            part = []
-    if part:
-        yield _pack_part(part)
-
-
-def _pack_part(part: list[np.ndarray]) -> str:
-    screens = np.stack(part)
-    screens[1:] ^= screens[:-1].copy()
-    return _pack(screens)
-
-
-def _exact_palette(recording: Recording) -> np.ndarray | None:
-    """The game's colours, 0xrrggbb, if they are few enough; an emulator has 128."""
-    seen = np.zeros(1 << 24, bool)
-    for screen in recording.screens:
-        seen[_codes(screen)] = True
-    colours = np.flatnonzero(seen)
-    return colours if len(colours) <= _COLOURS else None
-
-
-def _codes(screen: np.ndarray) -> np.ndarray:
-    red, green, blue = np.moveaxis(screen.astype(np.int32), -1, 0)
-    return red << 16 | green << 8 | blue
-
-
-def _chosen_palette(recording: Recording) -> Image.Image:
-    """256 colours that suit sixteen screens of the game."""
-    some = np.linspace(0, len(recording.screens) - 1, 16).astype(int)
-    sheet = np.concatenate([np.asarray(_small(recording, int(i))) for i in some])
-    return Image.fromarray(sheet).quantize(_COLOURS)
-
-
-def _small(recording: Recording, index: int) -> Image.Image:
-    height, width = _shrunk(recording)
-    return Image.fromarray(recording.screens[index]).resize((width, height), Image.Resampling.BOX)
-
-
-def _shrunk(recording: Recording) -> tuple[int, int]:
-    """Rows and columns of a screen on the page."""
-    height, width = recording.screens.shape[:2]
-    scale = min(1.0, (_MOST_PIXELS / (height * width)) ** 0.5)
-    return round(scale * height), round(scale * width)
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+    out: str = Field("player", description="Directory of the page.")
+    policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
+    seed: int = Field(0, description="Seed of the game.")
+    steps: int | None = Field(None, ge=1, description="Cut the game after so many decisions; null for the whole game.")
+    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
 
 def player(arguments: Sequence[str]) -> None:
     """The command; prints the path of the page."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored, directory = load_agent(options.run), make_directory(options.out)
+    stored, directory = load_agent(options.run, trust=options.trust), cli.make_directory(options.out)
     with progress_bar() as bar:
         greedy = options.policy == "greedy"
         recording = next(play(stored, bar, seed=options.seed, greedy=greedy, max_steps=options.steps))

@@ -8,342 +8,32 @@ not there, or not of whole games that the newest checkpoint played with sampled 
 
 from __future__ import annotations
 
-import base64
-import dataclasses
-import html
-import io
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
-from urllib.parse import quote
+from typing import Literal
 
-import numpy as np
-from matplotlib.figure import Figure
+from pydantic import Field
 
-from foajax import cli, cost, curves, heatmap
-from foajax.config import ConfigError, flatten, to_mapping
-from foajax.curves import RunData, read_run
-from foajax.heatmap import HeatMap
-from foajax.render import make_directory, play, progress_bar
-from foajax.rundir import FREE
-from foajax.scores import Interval, interval, iqm, normalised
-from foajax.status import newest_checkpoint
-from foajax.store import load_agent
-
-PAGE = "index.html"
-# Figs. 7 to 9 of the paper: experiments in the order of their legends.
-PRESETS = {
-    "constant": ("nonfoa", "constant50_sub1", "constant50_sub2", "constant70"),
-    "decreasing": ("constant70", "decreasing"),
-    "peripheral": ("constant70_p", "decreasing_p", "constant70", "decreasing"),
-}
-_PAPER_NAMES = {
-    "nonfoa": "Non-FoA, sub1",
-    "constant50_sub1": "Constant 50x50, sub1",
-    "constant50_sub2": "Constant 50x50, sub2",
-    "constant70": "Constant 70x70, sub2",
-    "decreasing": "Decreasing 30-50-70",
-    "constant70_p": "Constant(P) 70x70, sub2",
-    "decreasing_p": "Decreasing(P) 30-50-70",
-}
-_NOT_COMPARED = FREE | {"seed", "game", "name"}
-
-Groups = dict[str, list[RunData]]  # seeds of the same experiment, by the experiment's name
+from foajax import cli
+from foajax.config.parse import ConfigError, Section, refuse
+from foajax.reporting.curves import read_run
+from foajax.reporting.groups import games_of, runs_of
+from foajax.reporting.report_page import build, find_maps, note
+from foajax.runtime import wait_in_place
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes besides the runs."""
 
-    out: str = "report"  # directory
-    preset: Literal["constant", "decreasing", "peripheral"] | None = (
-        None  # only the experiments of a figure of the paper
+    out: str = Field("report", description="Directory of the page.")
+    preset: Literal["constant", "decreasing", "peripheral"] | None = Field(
+        None, description="Only the experiments of a figure of the paper."
     )
-    episodes: int = 3  # games for a heat map that has to be made; 0 for none
-    repeats: int = 50  # of each timing of a decision; 0 for no costs
-
-    def __post_init__(self) -> None:
-        for key in ("episodes", "repeats"):
-            if getattr(self, key) < 0:
-                raise ConfigError(f"{key}={getattr(self, key)}: accepted is an integer >= 0")
-
-
-def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
-    """The runs by game and experiment; of a preset in the paper's order and by the paper's names.
-
-    Raises:
-      ConfigError: no run is left; runs that are not of the same kind share a name.
-    """
-    games: dict[str, Groups] = {}
-    for run in runs:
-        base = run.config.name.removesuffix("_packed")
-        if preset is None or base in PRESETS[preset]:
-            games.setdefault(run.config.game, {}).setdefault(_label(run.config.name, preset), []).append(run)
-    if not games:
-        raise ConfigError(f"preset={preset}: accepted are runs of {', '.join(PRESETS[str(preset)])}")
-    for groups in games.values():
-        for name, seeds in groups.items():
-            if differences := _differences(seeds):
-                key, values = next(iter(differences.items()))
-                other = next(run for run, value in zip(seeds, values, strict=True) if value != values[0])
-                raise ConfigError(
-                    f"{other.path}: {name} differs in {key} from that of {seeds[0].path}; "
-                    "accepted are runs that differ in their seeds alone, or in their names"
-                )
-    if preset is None:
-        return games
-    order = [_label(name + suffix, preset) for name in PRESETS[preset] for suffix in ("", "_packed")]
-    return {game: {name: groups[name] for name in order if name in groups} for game, groups in games.items()}
-
-
-def _label(name: str, preset: str | None) -> str:
-    base = name.removesuffix("_packed")
-    return _PAPER_NAMES[base] + (", packed" if base != name else "") if preset else name
-
-
-def _differences(runs: Sequence[RunData]) -> dict[str, list[Any]]:
-    """The keys that matter to what is learned and do not have the same value in all runs."""
-    flat = [dict(flatten(to_mapping(run.config))) for run in runs]
-    keys = dict.fromkeys(key for each in flat for key in each)
-    values = {key: [each.get(key) for each in flat] for key in keys if key not in _NOT_COMPARED}
-    return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
-
-
-def final_scores(groups: Groups) -> dict[str, Interval]:
-    """The interquartile mean of each experiment's runs on one game."""
-    return {name: interval([_finals(runs)], iqm) for name, runs in groups.items()}
-
-
-def all_games(games: Mapping[str, Groups]) -> dict[str, Interval]:
-    """The same over all games, where their scores can be compared, for the experiments that have played all of them."""
-    result = {}
-    for name in _experiments(games):
-        strata = [normalised(game, _finals(groups[name])) for game, groups in games.items() if name in groups]
-        known = [scores for scores in strata if scores is not None]
-        if len(known) == len(games) > 1:
-            result[name] = interval(known, iqm)
-    return result
-
-
-def _runs(games: Mapping[str, Groups]) -> list[RunData]:
-    return [run for groups in games.values() for seeds in groups.values() for run in seeds]
-
-
-def _experiments(games: Mapping[str, Groups]) -> list[str]:
-    return list(dict.fromkeys(name for groups in games.values() for name in groups))
-
-
-def _finals(runs: Sequence[RunData]) -> np.ndarray:
-    return np.array([run.final_score for run in runs])
-
-
-class Page:
-    """The page's body, and the figures beside it."""
-
-    def __init__(self, directory: Path) -> None:
-        self._directory = directory
-        self._parts: list[str] = []
-
-    def add(self, text: str) -> None:
-        """Appends HTML."""
-        self._parts.append(text)
-
-    def figure(self, figure: Figure, name: str, alternative: str) -> None:
-        """Appends a figure as a drawing, and writes it as a PNG."""
-        figure.savefig(self._directory / f"{name}.png", dpi=160)
-        content = io.BytesIO()
-        figure.savefig(content, format="svg", metadata={"Date": None})
-        self.add(_image(content.getvalue(), "svg+xml", alternative))
-
-    def table(self, head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> None:
-        """Appends a table of HTML cells; `numbers` are the columns set to the right."""
-
-        def line(cells: Sequence[str], tag: str) -> str:
-            kind = [' class="number"' if i in numbers else "" for i in range(len(cells))]
-            inner = (f"<{tag}{k}>{cell}</{tag}>" for k, cell in zip(kind, cells, strict=True))
-            return f"<tr>{''.join(inner)}</tr>"
-
-        lines = [line(head, "th"), *(line(row, "td") for row in rows)]
-        self.add(f'<div class="wide"><table>{"".join(lines)}</table></div>')
-
-    def write(self) -> Path:
-        """Writes the page; returns its path."""
-        page = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
-        file = self._directory / PAGE
-        file.write_text(page.replace("{{body}}", "\n".join(self._parts)), encoding="utf-8")
-        return file
-
-
-def _image(content: bytes, kind: str, alternative: str) -> str:
-    data = base64.b64encode(content).decode()
-    return f'<img src="data:image/{kind};base64,{data}" alt="{html.escape(alternative)}">'
-
-
-def build(games: Mapping[str, Groups], maps: Mapping[Path, HeatMap], options: Options) -> Path:
-    """Writes the page and its figures; returns the page's path."""
-    directory = make_directory(options.out)
-    page = Page(directory)
-    runs = _runs(games)
-    page.add(f"<h1>foajax: {options.preset or 'report'}</h1>")
-    page.add(f'<p class="note">{_plural(len(runs), "run")} on {html.escape(", ".join(games))}.</p>')
-    _add_summary(page, games, options.repeats)
-    _add_curves(page, games)
-    _add_scores(page, games)
-    _add_maps(page, runs, maps, directory)
-    _add_differences(page, games)
-    _add_runs(page, runs, directory)
-    return page.write()
-
-
-def _add_summary(page: Page, games: Mapping[str, Groups], repeats: int) -> None:
-    page.add("<h2>At a glance</h2>")
-    first = {(game, name): runs[0].config for game, groups in games.items() for name, runs in groups.items()}
-    costs = cost.measure_decisions(list(first.values()), repeats=repeats) if repeats else [{}] * len(first)
-    rows = []
-    for (game, name), record in zip(first, costs, strict=True):
-        seeds = games[game][name]
-        cells = [html.escape(game), html.escape(name), str(len(seeds)), f"{min(s.env_steps[-1] for s in seeds):,.0f}"]
-        cells += [
-            f"{np.mean([s.time[-1] for s in seeds]) / 3600:.2f}",
-            html.escape(str(final_scores({name: seeds})[name])),
-        ]
-        if record:
-            cells += [f"{record['pixels_actual']:,}", f"{100 * record['pixels_ratio']:.0f} %"]
-            cells += [f"{record['torso_flops'] / 1e6:.2f}", f"{record['decision_flops'] / 1e6:.2f}"]
-            cells += [f"{record['decision_us_batch1'] / 1e3:.2f}"]
-        rows.append(cells)
-    head = ["game", "experiment", "runs", "env_steps", "hours", "score"]
-    if repeats:
-        head += ["values<br>shown", "of the<br>frame", "torso<br>MFLOP", "decision<br>MFLOP", "decision<br>ms"]
-    page.table(head, rows, numbers=range(2, len(head)))
-    page.add(
-        '<p class="note">Score: interquartile mean over runs [95 % interval], of evaluated games where a run has a '
-        "score.json, else of its last 100 games of training. Cost: one decision, batch 1, timed on this machine.</p>"
-    )
-
-
-def _add_curves(page: Page, games: Mapping[str, Groups]) -> None:
-    page.add("<h2>Learning curves</h2>")
-    colours = curves.colours_of(_experiments(games))
-    for game, groups in games.items():
-        figure = curves.draw_curves(groups, game, colours)
-        page.figure(figure, f"curves-{_file_name(game)}", f"learning curves on {game}")
-    note = "thin: single seeds; thick: their mean where all seeds have scores, with its 95 % bootstrap interval"
-    page.add(f'<p class="note">Full games, unclipped ({note}).</p>')
-
-
-def _add_scores(page: Page, games: Mapping[str, Groups]) -> None:
-    page.add("<h2>Final scores</h2>")
-    panels = {game: final_scores(groups) for game, groups in games.items()}
-    if together := all_games(games):
-        panels["all games, normalised"] = together
-        page.add('<p class="note">Normalised: 0 is random play, 1 a human tester (in seek: who sees everything).</p>')
-    figure = curves.draw_scores(panels, curves.colours_of(_experiments(games)))
-    page.figure(figure, "scores", "interquartile means of the final scores")
-
-
-def _add_maps(page: Page, runs: Sequence[RunData], maps: Mapping[Path, HeatMap], directory: Path) -> None:
-    if not maps:
-        return
-    page.add("<h2>Where they look</h2><div class='maps'>")
-    for run in runs:
-        if run.path in maps:
-            title = f"{run.config.name} on {run.config.game}"
-            figure = heatmap.draw(maps[run.path], title)
-            file = directory / f"heatmap-{_file_name(run.path.name)}.png"
-            figure.savefig(file, dpi=130)
-            page.add(f"<div>{_image(file.read_bytes(), 'png', f'heat map of {title}')}</div>")
-    page.add("</div>")
-
-
-def _add_differences(page: Page, games: Mapping[str, Groups]) -> None:
-    page.add("<h2>How they differ</h2>")
-    for game, groups in games.items():
-        rows = _differences([runs[0] for runs in groups.values()])
-        if rows:
-            cells = [[f"<code>{html.escape(k)}</code>", *(html.escape(str(v)) for v in row)] for k, row in rows.items()]
-            page.table([html.escape(game), *map(html.escape, groups)], cells)
-        else:
-            page.add(f'<p class="note">{html.escape(game)}: in their seeds alone.</p>')
-
-
-def _add_runs(page: Page, runs: Sequence[RunData], directory: Path) -> None:
-    page.add("<h2>Runs</h2>")
-    rows = []
-    for run in runs:
-        files = sorted([*run.path.glob("render/episode-*"), *run.path.glob("player/*.html"), *run.path.glob("*.html")])
-        links = (f'<a href="{quote(os.path.relpath(f, directory))}">{html.escape(f.name)}</a>' for f in files)
-        cells = [f"<code>{html.escape(str(run.path))}</code>", str(run.config.seed), f"{run.env_steps[-1]:,.0f}"]
-        rows.append([*cells, f"{run.final_score:.4g}", _origin(run), " ".join(links)])
-    page.table(["run", "seed", "env_steps", "score", "from", "to watch"], rows, numbers=(1, 2, 3))
-
-
-def _origin(run: RunData) -> str:
-    """Where the score is from; an evaluation may be of an earlier checkpoint."""
-    if run.evaluation is None:
-        return "training"
-    evaluated = run.evaluation.get("env_steps", run.env_steps[-1])
-    where = "" if evaluated == run.env_steps[-1] else f" at {evaluated:,} env_steps"
-    return f"evaluated{where}{', greedy' if run.evaluation.get('policy') == 'greedy' else ''}"
-
-
-def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]:
-    """Heat maps found in the runs' directories; of a group without any, its first run plays."""
-    maps: dict[Path, HeatMap] = {}
-    for groups in games.values():
-        for seeds in groups.values():
-            first, found = seeds[0], {run.path: heat for run in seeds if (heat := _stored_map(run))}
-            if not found and episodes and first.config.gaze.mode != "none" and (heat := _make_map(first, episodes)):
-                found = {first.path: heat}
-            maps |= found
-    return maps
-
-
-def _stored_map(run: RunData) -> HeatMap | None:
-    """The one in the run's directory, where a new one would be of the same agent and policy."""
-    file = run.path / "render" / heatmap.FILE
-    if not file.exists():
-        return None
-    heat = heatmap.read(file)
-    newest = newest_checkpoint(run.path) or int(run.env_steps[-1])  # a run may be kept without its checkpoints
-    if (heat.env_steps, heat.policy, heat.whole_games) == (newest, "sampled", True):
-        return heat
-    _note(f"{file}: left out, as it is not known to be of whole, sampled games at {newest:,} env_steps")
-    return None
-
-
-def _make_map(run: RunData, episodes: int) -> HeatMap | None:
-    """Of games played now; None where the run has nothing that could play."""
-    try:
-        stored = load_agent(run.path)
-        with progress_bar() as bar:
-            games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
-            heat = heatmap.heat_map([game._replace(images=()) for game in games])
-    except ConfigError as error:
-        _note(f"no heat map: {error}")
-        return None
-    file = run.path / "render" / heatmap.FILE
-    there = heatmap.read(file) if file.exists() else None
-    if there is None or (there.policy != "greedy" and there.whole_games is not False):  # others were made on purpose
-        try:
-            heatmap.save(heat, make_directory(file.parent), f"{run.config.name} on {run.config.game}")
-        except (ConfigError, OSError) as error:
-            _note(f"{file}: not kept ({error})")
-    return heat
-
-
-def _note(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-def _plural(count: int, word: str) -> str:
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
-
-
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "_-." else "-" for c in name)
+    episodes: int = Field(3, ge=0, description="Games for a heat map that has to be made; 0 for none.")
+    repeats: int = Field(50, ge=0, description="Repeats of each timing of a decision; 0 for no costs.")
+    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -352,17 +42,17 @@ def report(arguments: Sequence[str]) -> None:
     paths = [word for word in arguments if "=" not in word or os.path.isdir(word)]
     options = cli.parse(Options, [word for word in arguments if word not in paths])
     if not paths:
-        raise ConfigError("no runs: accepted is report runs/<a> runs/<b> ... out=report")
-    cost.wait_in_place()
-    runs = [read_run(path) for path in dict.fromkeys(map(Path, paths))]
+        raise refuse("no runs", accepted="report runs/<a> runs/<b> ... out=report")
+    wait_in_place()
+    runs = [read_run(path, trust=options.trust) for path in dict.fromkeys(map(Path, paths))]
     games = games_of(runs, options.preset)
-    shown = {run.path for run in _runs(games)}
+    shown = {run.path for run in runs_of(games)}
     if others := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:
-        _note(f"preset={options.preset} leaves out {', '.join(others)}")
-    make_directory(options.out)  # before games are played for what could not be written
+        note(f"preset={options.preset} leaves out {', '.join(others)}")
+    cli.make_directory(options.out)  # before games are played for what could not be written
     maps = find_maps(games, options.episodes)
     try:
-        print(build(games, maps, options))
+        print(build(games, maps, out=options.out, preset=options.preset, repeats=options.repeats))
     except OSError as error:
         raise ConfigError(f"out={options.out}: cannot be written ({error.strerror})") from None
 

@@ -11,187 +11,42 @@ brightest pixel of the frame is drawn white.
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import sys
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
-from PIL import Image, ImageDraw, ImageFont, ImageOps
+from pydantic import Field
 
-from foajax import cli, envs
-from foajax.compose import compose
-from foajax.config import Config, ConfigError, RingSensor, Sensor
-from foajax.drawing import draw_gaze
-from foajax.foveation import picture, pixel_count, sense
-from foajax.frames import to_frame
-
-PAPER = (
-    "nonfoa",
-    "constant50_sub1",
-    "constant50_sub2",
-    "constant70",
-    "decreasing",
-    "constant70_p",
-    "decreasing_p",
-)  # in the order of Table II
-_ALL = (*PAPER, "logpolar")
-
-_SIDE = 240  # of a panel, pixels: about three for each of an 80x80 frame
-_GAP = 12
-_LINE = 18  # of text
-_INK, _FAINT, _PAPER = "#222222", "#777777", "#ffffff"
-
-Panel = tuple[str, Image.Image]  # caption and picture
+from foajax import cli
+from foajax.config.compose import compose
+from foajax.config.parse import Section, refuse
+from foajax.config.schema import Config, Point
+from foajax.envs.make import make
+from foajax.sensors.frames import to_frame
+from foajax.sensors.registry import make_sensor
+from foajax.viewing.sheet import ALL, contact_sheet, draw, save
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes besides keys of the sensor."""
 
-    sensor: str = "constant70"  # one of the group sensor/, or all
-    game: str = "breakout"
-    points: tuple[tuple[int, int], ...] = ()  # (y, x) in frame pixels; none for the frame's centre
-    out: str = "show.png"
-    steps: int = 60  # random actions before the frame is taken
-    seed: int = 0
-    all: bool = False  # the same as sensor=all
+    sensor: str = Field("constant70", description="A choice of the group sensor/, or all.")
+    game: str = Field("breakout", description="The game whose frame is shown.")
+    points: tuple[Point, ...] = Field((), description="Focal points in frame pixels; none for the frame's centre.")
+    out: str = Field("show.png", description="The image, a .png file.")
+    steps: int = Field(60, ge=0, description="Random actions before the frame is taken.")
+    seed: int = Field(0, description="Seed of the game.")
+    all: bool = Field(False, description="The same as sensor=all.")
 
-    def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"steps={self.steps}: accepted is an integer >= 0")
+    def check(self) -> None:
         if not self.out.endswith(".png"):
-            raise ConfigError(f"out={self.out}: accepted is a file name that ends in .png")
-
-
-def draw(frame: np.ndarray, sensor: Sensor, points: Sequence[tuple[int, int]], *, name: str) -> Image.Image:
-    """One sensor on one frame: a heading and a row for each focal point.
-
-    Args:
-      frame: float32 [H, W] in [0, 1].
-      sensor: what to look through.
-      points: (y, x) in frame pixels, inside the frame.
-      name: of the sensor, for the heading.
-    """
-    rows = [_row(_panels(frame, sensor, point)) for point in points]
-    return _headed(_stack(rows), *_heading(frame, sensor, name))
-
-
-def contact_sheet(frame: np.ndarray, sensors: dict[str, Sensor], points: Sequence[tuple[int, int]]) -> Image.Image:
-    """Several sensors on one frame, two abreast; each with a pair of panels for every focal point."""
-    blocks = [
-        _headed(
-            _stack([_row(_panels(frame, sensor, point)[:2]) for point in points]),
-            *_heading(frame, sensor, name),
-        )
-        for name, sensor in sensors.items()
-    ]
-    return _stack([_beside(blocks[i : i + 2]) for i in range(0, len(blocks), 2)])
-
-
-def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[Panel]:
-    """The frame, what is seen of it, and the packed images."""
-    images, seen = _look(jnp.asarray(frame), jnp.asarray(point, jnp.int32), sensor)
-    white = float(frame.max()) or 1.0
-    panels = [
-        (f"frame, gaze at y {point[0]}, x {point[1]}", _marked(frame / white, sensor, point)),
-        ("what the sensor shows", _grey(np.asarray(seen)[..., 0] / white)),
-    ]
-    if isinstance(sensor, RingSensor) and sensor.layout == "canvas":
-        return panels
-    for i, image in enumerate(images):
-        caption = f"image {i}: {image.shape[0]} x {image.shape[1]}"
-        panels.append((caption, _grey(np.asarray(image)[..., 0] / white)))
-    return panels
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _look(
-    frame: Float[Array, "H W"], focal_point: Int[Array, "2"], sensor: Sensor
-) -> tuple[tuple[Float[Array, "_ _ 1"], ...], Float[Array, "H W 1"]]:
-    """What the sensor gives, and that put back in its place."""
-    images = sense(frame, focal_point, sensor=sensor)
-    shape = (frame.shape[0], frame.shape[1])
-    return images, picture(images, focal_point, sensor=sensor, frame_shape=shape)
-
-
-def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.Image:
-    """The frame with the focal areas and the focal point drawn on it."""
-    image = _grey(frame)
-    scale = image.width // frame.shape[1]
-    draw_gaze(image, sensor, point, scale=(scale, scale))
-    return image
-
-
-def _grey(values: np.ndarray) -> Image.Image:
-    """Values in [0, 1] as an image, each a square of pixels."""
-    scale = max(1, _SIDE // max(values.shape))
-    levels = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    image = Image.fromarray(levels).convert("RGB")
-    return image.resize((scale * image.width, scale * image.height), Image.Resampling.NEAREST)
-
-
-def _row(panels: Sequence[Panel]) -> Image.Image:
-    """Panels side by side, each under its caption."""
-    font, blocks = ImageFont.load_default(12), []
-    for caption, image in panels:
-        width = max(image.width + 2, round(font.getlength(caption)))
-        block = Image.new("RGB", (width, image.height + 2 + _LINE), _PAPER)
-        ImageDraw.Draw(block).text((0, 0), caption, fill=_FAINT, font=font)
-        # White pixels are to end somewhere on a white page.
-        block.paste(ImageOps.expand(image, 1, _FAINT), (0, _LINE))
-        blocks.append(block)
-    return _beside(blocks)
-
-
-def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
-    """The sensor's name, and its pixel budget as Table II counts it."""
-    count = pixel_count(sensor, frame.shape)
-    shown = "" if count.actual == count.nominal else f" ({count.actual:,} shown)"
-    return name, f"{count.nominal:,} values{shown}, {100 * count.nominal / frame.size:.0f}% of the frame"
-
-
-def _headed(image: Image.Image, title: str, note: str) -> Image.Image:
-    """An image under a heading."""
-    large, small = ImageFont.load_default(16), ImageFont.load_default(12)
-    start = round(large.getlength(title)) + _GAP
-    width = max(image.width, start + round(small.getlength(note)))
-    headed = Image.new("RGB", (width, image.height + _LINE + _GAP // 2), _PAPER)
-    pen = ImageDraw.Draw(headed)
-    pen.text((0, 14), title, fill=_INK, font=large, anchor="ls")
-    pen.text((start, 14), note, fill=_FAINT, font=small, anchor="ls")
-    headed.paste(image, (0, _LINE + _GAP // 2))
-    return headed
-
-
-def _beside(images: Sequence[Image.Image]) -> Image.Image:
-    """Images from left to right, their tops aligned."""
-    width = sum(image.width for image in images) + _GAP * (len(images) - 1)
-    joined = Image.new("RGB", (width, max(image.height for image in images)), _PAPER)
-    left = 0
-    for image in images:
-        joined.paste(image, (left, 0))
-        left += image.width + _GAP
-    return joined
-
-
-def _stack(images: Sequence[Image.Image]) -> Image.Image:
-    """Images from top to bottom."""
-    height = sum(image.height for image in images) + _GAP * (len(images) - 1)
-    joined = Image.new("RGB", (max(image.width for image in images), height), _PAPER)
-    top = 0
-    for image in images:
-        joined.paste(image, (0, top))
-        top += image.height + _GAP
-    return joined
+            raise refuse("out", self.out, "a file name that ends in .png")
 
 
 def play(config: Config, steps: int) -> np.ndarray:
     """The frame after `steps` random actions, float32 [H, W] in [0, 1]."""
-    environment = envs.make(config, num_envs=1, seed=config.seed)
+    environment = make(config, num_envs=1, seed=config.seed)
     try:
         timestep, _ = environment.reset()
         random = np.random.default_rng(config.seed)
@@ -209,32 +64,22 @@ def show(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, [word for word in arguments if word not in own])
     sheet = options.all or options.sensor == "all"
     if sheet and own:
-        raise ConfigError(f"{own[0]}: accepted is a key of one sensor, without sensor=all")
+        raise refuse(own[0], accepted="a key of one sensor, without sensor=all")
     words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
-    configs = {name: compose([f"sensor={name}", *words]) for name in (_ALL if sheet else (options.sensor,))}
+    configs = {name: compose([f"sensor={name}", *words]) for name in (ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape
     points = options.points or ((height // 2, width // 2),)
     for y, x in points:
         if not (0 <= y < height and 0 <= x < width):
-            raise ConfigError(f"points=[{y}, {x}]: accepted is [y, x] inside the frame, {height}x{width}")
+            raise refuse("points", f"[{y}, {x}]", f"[y, x] inside the frame, {height}x{width}")
     frame = play(config, options.steps)
     if sheet:
-        image = contact_sheet(frame, {name: each.sensor for name, each in configs.items()}, points)
+        image = contact_sheet(frame, {name: make_sensor(each.sensor) for name, each in configs.items()}, points)
     else:
-        image = draw(frame, config.sensor, points, name=options.sensor)
-    _save(image, options.out)
+        image = draw(frame, make_sensor(config.sensor), points, name=options.sensor)
+    save(image, options.out)
     print(options.out)
-
-
-def _save(image: Image.Image, out: str) -> None:
-    """Writes a PNG with a margin; 64 colours are enough for grey levels, rings and text."""
-    page = Image.new("RGB", (image.width + 2 * _GAP, image.height + 2 * _GAP), _PAPER)
-    page.paste(image, (_GAP, _GAP))
-    try:
-        page.quantize(64, dither=Image.Dither.NONE).save(out, optimize=True)
-    except OSError as error:
-        raise ConfigError(f"out={out}: accepted is a file that can be written ({error.strerror})") from None
 
 
 if __name__ == "__main__":

@@ -1,167 +1,25 @@
-"""Trained agents on disk: `agent.json` and `config.yaml` beside either checkpoints or one safetensors file.
+"""`python -m foajax.store run=<dir> out=<dir>`: makes of a run an agent to be shipped.
 
-A run directory and a shipped agent are read alike. `python -m foajax.store run=<dir> out=<dir>` makes the latter
-from the former: parameters and frame statistics only, readable without this package.
+It has parameters and frame statistics only, as one safetensors file, and can be read without this package.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-import yaml
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from pydantic import Field
 
-from foajax import cli, durable
-from foajax.agent import Agent
-from foajax.checkpoint import Checkpoints
-from foajax.config import Config, ConfigError, flatten, to_mapping
-from foajax.programs import make_state
-from foajax.rundir import PARAMETERS, is_run, load_config
-from foajax.types import FrameStatistics, Params, TrainState
-
-_FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
-CHECKPOINTS = "checkpoints"
+from foajax import cli
+from foajax.config.parse import Section, refuse
+from foajax.runs.agents import FACTS, TrainedAgent, load_agent, load_score, save_agent
+from foajax.runs.directory import PARAMETERS
 
 
-class Stored(NamedTuple):
-    """An agent read from disk."""
-
-    agent: Agent
-    params: Params
-    statistics: FrameStatistics
-    env_steps: int  # it has been trained for
-
-
-def save_facts(agent: Agent, directory: Path, **more: Any) -> None:
-    """Writes what `load_agent` needs beside `config.yaml`, and more facts if there are."""
-    facts = {"num_actions": agent.num_actions, "crop_top": agent.crop_top}
-    durable.replace(directory / _FACTS, (json.dumps(facts | more) + "\n").encode())
-
-
-def load_score(path: str | Path) -> dict[str, Any] | None:
-    """What `evaluate` found of a shipped agent: mean, stderr, episodes, policy; None where nobody has said."""
-    try:
-        return json.loads((Path(path) / _FACTS).read_text()).get("score")
-    except (OSError, ValueError, AttributeError):
-        return None
-
-
-def load_agent(path: str | Path, *, best: bool = False) -> Stored:
-    """Reads a shipped agent or, of a run, the newest good checkpoint, or the `best` kept by its score in training.
-
-    Raises:
-      ConfigError: there is neither, or it cannot be read.
-    """
-    path = Path(path)
-    config = load_config(path)
-    try:
-        facts = json.loads((path / _FACTS).read_text())
-        agent = Agent(config, facts["num_actions"], facts["crop_top"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"run={path}: {_FACTS} is missing or not readable; accepted is a run or an agent") from None
-    if not isinstance(agent.num_actions, int) or agent.num_actions < 1:
-        raise ConfigError(f"run={path}: {_FACTS} has num_actions={agent.num_actions}; accepted is an integer >= 1")
-    if (path / PARAMETERS).exists():
-        return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
-    template = jax.eval_shape(lambda: make_state(agent, 0))
-    checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
-    restored = checkpoints.restore_part({"train": template}, best=best)
-    if restored is None:
-        raise ConfigError(f"run={path}: has no checkpoint yet")
-    env_steps, state, _ = restored
-    return Stored(agent, state["train"].params, state["train"].statistics, env_steps)
-
-
-def check_source(path: str) -> None:
-    """`ConfigError`, about `train.init_from`, where `path` is neither a run nor an agent."""
-    try:
-        load_config(path)
-    except ConfigError as error:
-        raise ConfigError(f"train.init_from={path}: {error}") from None
-
-
-def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
-    """The state at the start of a run, with a stored agent's parameters and frame statistics.
-
-    Raises:
-      ConfigError: there is no such agent, or it has another network or other images.
-    """
-    key = f"train.init_from={path}"
-    try:
-        stored = load_agent(path)
-    except ConfigError as error:
-        raise ConfigError(f"{key}: {error}") from None
-    there, wanted = (named((s.params, s.statistics)) for s in (stored, state))
-    for name in [*wanted, *there]:
-        have, want = (arrays[name].shape if name in arrays else None for arrays in (there, wanted))
-        if have != want:
-            accepted = (
-                f"an agent with this run's sensor, network, gaze and number of actions; {_differences(stored, config)}"
-            )
-            raise ConfigError(f"{key}: {name} has the shape {have}, here it is {want}; accepted is {accepted}")
-    params, statistics = jax.tree.map(jnp.asarray, (stored.params, stored.statistics))
-    return state._replace(params=params, statistics=statistics)
-
-
-def _differences(stored: Stored, config: Config) -> str:
-    """What of another configuration may be why an agent's parameters do not fit it."""
-    there, here = (dict(flatten(to_mapping(c))) for c in (stored.agent.config, config))
-    groups = ("sensor", "network", "gaze")
-    differ = [key for key in there if key.startswith(groups) and here.get(key) != there[key]]
-    return "that one has " + (", ".join(f"{key}={there[key]}" for key in differ) or "other actions")
-
-
-def save_agent(stored: Stored, directory: Path, score: Mapping[str, Any] | None = None) -> None:
-    """Writes a shipped agent: float32 arrays by name, the configuration and the facts, its score among them.
-
-    Raises:
-      ConfigError: `directory` is a run's, or cannot be written.
-    """
-    if is_run(directory):
-        raise ConfigError(f"out={directory}: is a run; accepted is another directory")
-    config = to_mapping(dataclasses.replace(stored.agent.config, run=None))  # where it was trained does not matter
-    known = {} if score is None else {"score": dict(score)}
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        save_file(named((stored.params, stored.statistics)), directory / PARAMETERS)
-        (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-        save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
-    except (OSError, SafetensorError) as error:
-        raise ConfigError(f"out={directory}: accepted is a directory that can be written ({error})") from None
-
-
-def _load_shipped(agent: Agent, file: Path, env_steps: int) -> Stored:
-    template = jax.eval_shape(lambda: make_state(agent, 0))
-    wanted = (template.params, template.statistics)
-    try:
-        arrays = load_file(file)
-    except (OSError, SafetensorError) as error:
-        raise ConfigError(f"run={file.parent}: {file.name} is not readable: {str(error).splitlines()[0]}") from None
-    names = named(wanted)
-    if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
-        raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
-    leaves = [jnp.asarray(arrays[name]) for name in names]  # once: NumPy's would be handed over at each decision
-    params, statistics = jax.tree.unflatten(jax.tree.structure(wanted), leaves)
-    return Stored(agent, params, statistics, env_steps)
-
-
-def named(tree) -> dict:
-    """Leaves by their path, e.g. `0/params/dense/kernel`."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-    return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named.items()}
-
-
-def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
+def _read_score(file: Path, stored: TrainedAgent) -> dict[str, Any]:
     config = stored.agent.config
     expected = {"game": config.game, "experiment": config.name, "env_steps": stored.env_steps}
     try:
@@ -169,29 +27,31 @@ def _read_score(file: Path, stored: Stored) -> dict[str, Any]:
         found = {key: result[key] for key in expected}
         score = {key: result[key] for key in ("mean", "stderr", "episodes", "policy")}
     except (OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"score={file}: accepted is a file that evaluate json=<file> has written") from None
+        raise refuse("score", file, "a file that evaluate json=<file> has written") from None
     if found != expected:
-        raise ConfigError(f"score={file}: is of {found}; accepted is that of this agent, {expected}")
+        raise refuse("score", file, f"that of this agent, {expected}", why=f"is of {found}")
     return score
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Section):
     """What the command takes."""
 
-    run: str
-    out: str
-    checkpoint: Literal["newest", "best"] = "newest"  # of a run: the latest, or that with the best score in training
-    score: str | None = None  # file that `evaluate json=` has written, to go with the agent
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+    out: str = Field(description="Directory of the agent.")
+    checkpoint: Literal["newest", "best"] = Field(
+        "newest", description="Of a run: the latest, or that with the best score in training."
+    )
+    score: str | None = Field(None, description="File that `evaluate json=` has written, to go with the agent.")
+    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
 
 
 def export(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
-    stored = load_agent(options.run, best=options.checkpoint == "best")
+    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
     score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)
     save_agent(stored, Path(options.out), score)
-    print(f"{options.out}: {PARAMETERS}, config.yaml, {_FACTS}")
+    print(f"{options.out}: {PARAMETERS}, config.yaml, {FACTS}")
 
 
 if __name__ == "__main__":

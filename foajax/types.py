@@ -43,7 +43,7 @@ class CoreState(NamedTuple):
 class ActorState(NamedTuple):
     """What an actor remembers between two steps."""
 
-    core_state: CoreState
+    core_state: Any  # the core's carry, a pytree of [B, ...]
     focal_point: Int[Array, "B 2"]  # (y, x) in frame pixels, used to sense the next frame
     age: Int[Array, "B"]  # steps since the episode began, for a scripted gaze
     last_actions: Int[Array, "B 2"] | None = None  # natural, visual; None where the network is not told
@@ -80,7 +80,7 @@ class Rollout(NamedTuple):
     """T transitions of B environments: T+1 rows, the last one only to bootstrap from."""
 
     steps: ActorOutput  # each field [T+1, B, ...]
-    core_state: CoreState  # [B, L], enters row 0
+    core_state: Any  # the core's carry, [B, ...], enters row 0
 
 
 class FrameStatistics(NamedTuple):

@@ -5,7 +5,7 @@
 #   sbatch slurm/multi_node.sh game=breakout experiment=constant70_packed seed=1
 #   sbatch --nodes=8 slurm/multi_node.sh env.num_envs=1024 ...
 #
-# env.num_envs counts the environments of the whole run, and each minibatch (env.num_envs / learner.minibatches) is
+# env.num_envs counts the environments of the whole run, and each minibatch (env.num_envs / learner.num_minibatches) is
 # spread over all devices: it has to be a multiple of their number. docs/scaling.md says what bounds the speed.
 #SBATCH --job-name=foajax
 #SBATCH --nodes=4

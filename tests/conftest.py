@@ -37,13 +37,13 @@ def no_process_is_left():
 @pytest.fixture(scope="session")
 def untrained():
     """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
-    from foajax.store import Stored
+    from foajax.runs.agents import TrainedAgent
 
     def make(agent, env_steps=0):
         random = np.random.default_rng(0)
         shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
         params = jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
-        return Stored(agent, params, agent.initial_statistics(), env_steps)
+        return TrainedAgent(agent, params, agent.initial_statistics(), env_steps)
 
     return make
 
@@ -51,8 +51,8 @@ def untrained():
 @pytest.fixture(scope="session")
 def breakout_agent(untrained):
     """A small agent for Breakout that has learned nothing."""
-    from foajax.agent import Agent
-    from foajax.compose import compose
+    from foajax.config.compose import compose
+    from foajax.learning.agent import Agent
 
     words = ["sensor=decreasing_p_packed", "name=small", "network.dense=16", "network.lstm=16", "gaze.bounds=point"]
     return untrained(Agent(compose(words), num_actions=4, crop_top=34))
@@ -61,6 +61,6 @@ def breakout_agent(untrained):
 @pytest.fixture(scope="session")
 def recording(breakout_agent):
     """The first decisions of a game of Breakout on the real emulator."""
-    from foajax.recording import record
+    from foajax.viewing.recording import record
 
     return next(record(breakout_agent, seed=4, max_steps=130))

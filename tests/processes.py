@@ -18,8 +18,9 @@ TINY = [
     "network.dense=16",
     "network.lstm=16",
     "env.num_envs=8",
-    "learner.minibatches=2",
+    "learner.num_minibatches=2",
     "learner.rollout_length=5",
+    "learner.schedule=constant",  # so that a run may be made longer
     "train.log_every=0.01",
 ]
 

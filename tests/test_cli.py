@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import re
 
 import pytest
 
 from foajax import cli
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError, Section
 
 
-@dataclasses.dataclass(frozen=True)
-class Words:
+class Words(Section):
     count: int = 1
     every: float | None = 2.0
     name: str | None = None

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from foajax import cli, demo, evaluate, store
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError
+from foajax.runs import agents
+from foajax.viewing import games
 
 EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}
 
@@ -18,9 +20,9 @@ EVALUATED = {"mean": 9.0, "stderr": 0.5, "episodes": 30, "policy": "sampled"}
 def shipped(breakout_agent, tmp_path, monkeypatch):
     """Two agents for Breakout, and one that is said to play Pong and has no score."""
     directory = tmp_path / "agents"
-    store.save_agent(breakout_agent, directory / "poor", EVALUATED | {"mean": 2.0})
-    store.save_agent(breakout_agent, directory / "good", EVALUATED)
-    store.save_agent(breakout_agent, directory / "untold")
+    agents.save_agent(breakout_agent, directory / "poor", EVALUATED | {"mean": 2.0})
+    agents.save_agent(breakout_agent, directory / "good", EVALUATED)
+    agents.save_agent(breakout_agent, directory / "untold")
     config = directory / "untold" / "config.yaml"
     config.write_text(config.read_text().replace("game: breakout", "game: pong"))
     monkeypatch.setattr(demo, "agents", lambda: directory)
@@ -60,15 +62,15 @@ def test_nothing_shipped_is_one_line(tmp_path, monkeypatch, capsys):
 
 
 def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
-    stored = store.load_agent(shipped / "untold")
+    stored = agents.load_agent(shipped / "untold")
     config = stored.agent.config
     facts = {"game": config.game, "experiment": config.name, "env_steps": stored.env_steps, "returns": [9.0], "seed": 0}
     (tmp_path / "score.json").write_text(json.dumps(EVALUATED | facts))
     words = [f"run={shipped / 'untold'}", f"out={tmp_path / 'again'}"]
     assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 0
-    assert store.load_score(tmp_path / "again") == EVALUATED and store.load_score(shipped / "untold") is None
+    assert agents.load_score(tmp_path / "again") == EVALUATED and agents.load_score(shipped / "untold") is None
     assert cli.run(store.export, [f"run={tmp_path / 'again'}", f"out={tmp_path / 'third'}"]) == 0
-    assert store.load_score(tmp_path / "third") == EVALUATED
+    assert agents.load_score(tmp_path / "third") == EVALUATED
     (tmp_path / "score.json").write_text(json.dumps(EVALUATED | facts | {"game": "chess"}))
     assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 2
     assert "is of {'game': 'chess'" in capsys.readouterr().err
@@ -78,15 +80,15 @@ def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
 
 
 def test_a_run_is_not_overwritten_by_an_agent(breakout_agent, tmp_path):
-    store.save_agent(breakout_agent, tmp_path / "run")
+    agents.save_agent(breakout_agent, tmp_path / "run")
     (tmp_path / "run" / "run.json").write_text('{"starts": []}')
     before = (tmp_path / "run" / "config.yaml").stat().st_mtime_ns
     with pytest.raises(ConfigError, match=r"out=.*/run: is a run; accepted is another directory"):
-        store.save_agent(breakout_agent, tmp_path / "run")
+        agents.save_agent(breakout_agent, tmp_path / "run")
     assert (tmp_path / "run" / "config.yaml").stat().st_mtime_ns == before
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"out=.*/file: accepted is a directory that can be written"):
-        store.save_agent(breakout_agent, tmp_path / "file")
+        agents.save_agent(breakout_agent, tmp_path / "file")
 
 
 SHIPPED = sorted(file.parent for file in demo.agents().glob("*/config.yaml"))
@@ -94,21 +96,21 @@ SHIPPED = sorted(file.parent for file in demo.agents().glob("*/config.yaml"))
 
 @pytest.mark.parametrize("path", SHIPPED, ids=[path.name for path in SHIPPED])
 def test_a_shipped_agent_can_be_read_and_has_its_score(path):
-    stored = store.load_agent(path)
+    stored = agents.load_agent(path)
     assert stored.agent.config.game in path.name and stored.env_steps > 1e6
-    assert store.load_score(path)["episodes"] == 30
+    assert agents.load_score(path)["episodes"] == 30
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((stored.params, stored.statistics)))
 
 
 @pytest.mark.slow
 def test_a_shipped_agent_plays_as_well_as_it_says():
-    stored = store.load_agent(demo.agents() / "pong-nonfoa")
-    games = evaluate.play(stored, episodes=2, num_envs=2, seed=0, greedy=False)
-    assert games.returns.mean() > 10
+    stored = agents.load_agent(demo.agents() / "pong-nonfoa")
+    played = games.play(stored, episodes=2, num_envs=2, seed=0, greedy=False)
+    assert played.returns.mean() > 10
 
 
 def test_parameters_are_on_the_device(shipped):
-    stored = store.load_agent(shipped / "good")
+    stored = agents.load_agent(shipped / "good")
     assert all(isinstance(x, jax.Array) for x in jax.tree.leaves((stored.params, stored.statistics)))
 
 
@@ -135,4 +137,4 @@ def test_help_names_every_key(capsys):
     assert cli.run(demo.demo, ["--help"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("`python -m foajax.demo`")
-    assert "\n  steps=6000: an integer\n" in out and "\n  game=null: a string or null\n" in out
+    assert "\n  steps=6000  Decisions at most; " in out and "Accepted: an integer >= 1.\n" in out

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from foajax.config.schema import Config
+from foajax.config.table import page as page_of_keys
+
 ROOT = Path(__file__).parent.parent
 BLOCKS = [
     pytest.param(block, id=f"{page}-{i}")
-    for page in ("README.md", "docs/embedding.md")
+    for page in ("README.md", "docs/embedding.md", "docs/extending.md")
     for i, block in enumerate(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL))
 ]
 SAID = re.compile(r"^(\S.*)  # ((?:Dict)?[(\[].*)$", re.MULTILINE)
@@ -27,12 +30,17 @@ def test_a_block_of_code_runs_and_gives_what_it_says(block, monkeypatch):
 
 
 def test_there_are_blocks_and_values():
-    assert len(BLOCKS) == 4
-    assert sum(len(SAID.findall(str(block.values[0]))) for block in BLOCKS) == 4
+    assert len(BLOCKS) == 9
+    assert sum(len(SAID.findall(str(block.values[0]))) for block in BLOCKS) == 12
+
+
+def test_the_page_of_keys_is_what_the_schema_says():
+    assert (ROOT / "docs/keys.md").read_text() == page_of_keys(Config) + "\n"
 
 
 def test_links_lead_somewhere():
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md"), *ROOT.glob("*/README.md")]
+    own = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    pages = [*own, *ROOT.glob("*/README.md"), *ROOT.glob("results/*/README.md")]
     for page in pages:
         for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
             assert (page.parent / link).exists(), (page.name, link)

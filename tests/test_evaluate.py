@@ -8,35 +8,37 @@ import jax
 import numpy as np
 import pytest
 
-from foajax import cli, demo, evaluate
-from foajax.agent import Agent
-from foajax.compose import compose
-from foajax.evaluate import Games
-from foajax.store import Stored, load_agent
+from foajax import cli, evaluate
+from foajax.config import shipped
+from foajax.config.compose import compose
+from foajax.learning.agent import Agent
+from foajax.runs.agents import TrainedAgent, load_agent
+from foajax.viewing import games
+from foajax.viewing.games import Games, play
 
-PONG = demo.agents() / "pong-constant70_packed"
+PONG = shipped.agents() / "pong-constant70_packed"
 
 
 @pytest.fixture(scope="module")
-def breakout() -> Stored:
+def breakout() -> TrainedAgent:
     """An agent that has not learned anything."""
     agent = Agent(compose(["experiment=constant50_sub2_packed", "network.dense=16", "network.lstm=16"]), 4, 34)
-    return Stored(agent, agent.initial_params(jax.random.key(0)), agent.initial_statistics(), env_steps=0)
+    return TrainedAgent(agent, agent.initial_params(jax.random.key(0)), agent.initial_statistics(), env_steps=0)
 
 
 def test_neighbouring_seeds_share_no_game(breakout):
     """EnvPool adds an environment's number to the seed; seed 0's second game was seed 1's first."""
     seeds = []
-    original = evaluate.make
+    original = games.make
 
     def make(config, **how):
         seeds.append(how["seed"])
         return original(config, **how)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate, "make", make)
+        patch.setattr(games, "make", make)
         for seed in (0, 1, 2):
-            evaluate.environment(breakout, num_envs=1, seed=seed).close()
+            games.environment(breakout, num_envs=1, seed=seed).close()
     assert np.diff(np.sort(seeds)).min() > 10_000 and max(seeds) < 2**31
 
 
@@ -52,9 +54,12 @@ def test_another_protocol_is_played_and_noted(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("env.frame_shape=[84,84]", "env.frame_shape=[84,84]: accepted of env are engine, frame_skip,"),
-        ("env.stickiness=0.25", "env.stickiness=0.25: accepted of env are engine, frame_skip, noop_max"),
-        ("env.sticky_actions=2", "env.sticky_actions=2.0: accepted is a probability in [0, 1)"),
+        (
+            "env.frame_shape=[84,84]",
+            "env.frame_shape=[84, 84]: cannot be changed; accepted is one of engine, frame_skip,",
+        ),
+        ("env.stickiness=0.25", "env.stickiness=0.25: cannot be changed; accepted is one of engine, frame_skip,"),
+        ("env.sticky_actions=2", "env.sticky_actions=2.0: accepted is a number in [0, 1)"),
     ],
 )
 def test_what_a_protocol_cannot_change_is_refused(capsys, word, said):
@@ -68,11 +73,11 @@ def test_who_never_serves_is_cut(breakout):
     agent = Agent(compose([*words, "env.episodic_life=false", "env.max_episode_steps=700"]), 4, 34)
     params = jax.tree.map(np.copy, breakout.params)
     params["params"]["natural_policy"]["bias"] = np.array([9, 0, 0, 0], np.float32)  # waits
-    waiting = Stored(agent, params, breakout.statistics, env_steps=0)
-    games = evaluate.play(waiting, episodes=2, num_envs=2, seed=0, greedy=True)
-    assert isinstance(games, Games) and games.cut == 2 and games.lengths.tolist() == [700, 700]
+    waiting = TrainedAgent(agent, params, breakout.statistics, env_steps=0)
+    played = play(waiting, episodes=2, num_envs=2, seed=0, greedy=True)
+    assert isinstance(played, Games) and played.cut == 2 and played.lengths.tolist() == [700, 700]
 
 
 def test_a_shipped_agent_wins_with_another_seed():
-    games = evaluate.play(load_agent(PONG), episodes=2, num_envs=2, seed=7, greedy=False)
-    assert games.returns.mean() > 10 and games.cut == 0
+    played = play(load_agent(PONG), episodes=2, num_envs=2, seed=7, greedy=False)
+    assert played.returns.mean() > 10 and played.cut == 0

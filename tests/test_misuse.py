@@ -16,10 +16,10 @@ import json, sys
 import gymnasium, numpy as np
 from gymnasium import spaces
 from foajax import FoveatedObservation, LogPolarSensor, RingSensor, sense
-from foajax.agent import Agent
-from foajax.compose import compose
-from foajax.config import GazeConfig
-from foajax.gymnasium_env import gray_frames
+from foajax.learning.agent import Agent
+from foajax.config.compose import compose
+from foajax.config.schema import GazeConfig
+from foajax.envs.gymnasium import gray_frames
 
 class Pixels(gymnasium.Env):
     observation_space, action_space = spaces.Box(0, 255, (16, 20), np.uint8), spaces.Discrete(2)
@@ -36,21 +36,21 @@ for line in json.load(sys.stdin):
         said.append(str(error))
 print(json.dumps(said))
 """
-RING = "accepted is [an integer, an integer, an integer]"
+RING = "accepted is a list of at least one [height, width, factor]"
 MISTAKES = {
     "RingSensor(((8, 8, 1),), layout='Canvas')": "sensor.layout=Canvas: accepted is one of canvas, packed",
-    "RingSensor(((8, 8),))": f"sensor.rings=[8, 8]: {RING}",
-    "RingSensor((8, 8, 1))": f"sensor.rings=8: {RING}",
-    "RingSensor(((8, 8, 1),), peripheral=5)": "sensor.peripheral=5: accepted is [an integer, an integer] or null",
+    "RingSensor(((8, 8),))": f"sensor.rings=[[8, 8]]: {RING}",
+    "RingSensor((8, 8, 1))": f"sensor.rings=[8, 8, 1]: {RING}",
+    "RingSensor(((8, 8, 1),), peripheral=5)": "sensor.peripheral=5: accepted is [rows, columns] >= 1 or null",
     "LogPolarSensor(sampling='nearest')": "sensor.sampling=nearest: accepted is one of area, bilinear",
     "GazeConfig(actions=12)": "gaze.actions=12: accepted is one of 5, 9",
     "GazeConfig(step=2.5)": "gaze.step=2.5: accepted is an integer",
-    "GazeConfig(start='center')": "gaze.start=center: accepted is one of centre, random or [an integer, an integer]",
+    "GazeConfig(start='center')": "gaze.start=center: accepted is one of centre, random or [y, x]",
     "sense(np.zeros((16, 20)), np.array([8.0, 8.0]), sensor=sensor)": "focal_point=float32: accepted is integers, ",
     "sense(np.zeros((16, 20)), np.array(8), sensor=sensor)": "focal_point=[]: accepted is (y, x), jax.vmap for more",
     "sense(np.zeros((16, 20)), np.zeros((3, 2), int), sensor=sensor)": "focal_point=[3, 2]: accepted is (y, x)",
     "sense(np.zeros((2, 8, 8, 3)), np.array([4, 4]), sensor=sensor)": "frame=[2, 8, 8, 3]: accepted is [H, W] or ",
-    "FoveatedObservation(Pixels(), None)": "sensor=None: accepted is a RingSensor, a LogPolarSensor or ",
+    "FoveatedObservation(Pixels(), None)": "sensor=null: accepted is a RingSensor, a LogPolarSensor or ",
     "FoveatedObservation(Pixels(), sensor, 'learned')": "gaze=learned: accepted is a GazeConfig",
     "atari.frame(np.zeros((1, 210, 160)))": "frame=float64 [1, 210, 160]: accepted is uint8 [B, 210, 160], gray",
     "atari.frame(np.zeros((1, 80, 80), np.uint8))": "frame=uint8 [1, 80, 80]: accepted is uint8 [B, 210, 160], gray",

@@ -11,8 +11,10 @@ import pytest
 from browser import browser_needed, opened_page
 
 from foajax import cli, player
-from foajax.painting import packed, paint, tables
-from foajax.recording import Screens
+from foajax.sensors.reconstruct import paint, tables
+from foajax.sensors.registry import make_sensor
+from foajax.viewing import player_page
+from foajax.viewing.recording import Screens
 
 ARTEFACTS = Path(__file__).resolve().parent.parent / "build"
 GAZE = """() => {  // centre of all that is drawn in the colour of the focal point, in CSS pixels
@@ -45,7 +47,7 @@ def go(page, step):
 
 @browser_needed
 def test_the_player(recording, tmp_path):
-    with opened(player.write_page(recording, tmp_path)) as page:
+    with opened(player_page.write_page(recording, tmp_path)) as page:
         pictures_are_what_was_recorded(page, recording)
         numbers_are_what_was_recorded(page, recording)
         the_focal_point_is_where_it_was(page, recording)
@@ -58,7 +60,7 @@ def test_the_player(recording, tmp_path):
 
 def pictures_are_what_was_recorded(page, recording):
     values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
-    painting = tables(packed(recording.config.sensor), recording.config.env.frame_shape)
+    painting = tables(make_sensor(recording.config.sensor).packed, recording.config.env.frame_shape)
     for step in (119, 0, 60, 59, 129):  # parts of 60 steps begin and end here
         go(page, step)
         screen = np.array(page.evaluate(PIXELS, "screen")).reshape(210, 160, 4)
@@ -74,7 +76,7 @@ def numbers_are_what_was_recorded(page, recording):
         shares = page.locator(f"#{head} .row > :last-child").all_inner_texts()
         np.testing.assert_allclose([float(share.rstrip("%")) for share in shares], 100 * probs[77], atol=0.8)
         chosen = page.locator(f"#{head} .row.chosen > :first-child").inner_text()
-        names = recording.actions if head == "natural" else player.NAMES
+        names = recording.actions if head == "natural" else player_page.NAMES
         assert chosen == names[getattr(recording, f"{head}_action")[77]]
         value = float(page.locator(f"#{head}Value").inner_text())
         assert value == pytest.approx(getattr(recording, f"{head}_value")[77], abs=0.006)
@@ -130,7 +132,7 @@ def it_plays(page):
 @browser_needed
 @pytest.mark.slow
 def test_ten_minutes_fit_into_15_mb_and_scrub_without_lag(recording, tmp_path):
-    page_file = player.write_page(lengthened(recording, 9000), tmp_path)
+    page_file = player_page.write_page(lengthened(recording, 9000), tmp_path)
     assert page_file.stat().st_size < 15e6
     random, waits = np.random.default_rng(0), []
     with opened(page_file) as page:
@@ -165,7 +167,7 @@ def test_more_colours_than_a_palette_has_and_large_screens_are_reduced(recording
     for _ in range(70):
         screens.append(noise.integers(0, 256, (400, 600, 3), dtype=np.uint8))
     few = lengthened(recording, 70)._replace(screens=screens, crop_top=None)
-    encoded = player.encode(few)
+    encoded = player_page.encode(few)
     height, width = encoded["screen_shape"]
     assert height * width < 48_500 and width / height == pytest.approx(1.5, rel=0.01)
     assert len(encoded["palette"]) == 256 and len(encoded["screens"]) == len(encoded["values"]) == 2
@@ -173,7 +175,7 @@ def test_more_colours_than_a_palette_has_and_large_screens_are_reduced(recording
 
 
 def test_a_gaze_that_is_not_learned_leaves_its_head_out(recording):
-    encoded = player.encode(recording._replace(vision_probs=None, vision_value=None, lives=None))
+    encoded = player_page.encode(recording._replace(vision_probs=None, vision_value=None, lives=None))
     assert not {"vision_probs", "vision_value", "lives"} & set(encoded["columns"])
 
 
@@ -181,7 +183,7 @@ def test_a_gaze_that_is_not_learned_leaves_its_head_out(recording):
     "words, message",
     [
         (["run=nowhere"], "run=nowhere: does not exist"),
-        (["run=nowhere", "steps=0"], "steps=0: accepted is null or an integer >= 1"),
+        (["run=nowhere", "steps=0"], "steps=0: accepted is an integer >= 1 or null"),
         (["run=nowhere", "policy=best"], "policy=best: accepted is one of sampled, greedy"),
     ],
 )

@@ -8,11 +8,12 @@ import pytest
 from PIL import Image
 
 from foajax import cli, render
-from foajax.compose import compose
-from foajax.drawing import NATURAL, RINGS
-from foajax.recording import Screens
-from foajax.scene import _MARGIN, _TOP, Scene, _dim
-from foajax.store import save_agent
+from foajax.config.compose import compose
+from foajax.runs.agents import save_agent
+from foajax.viewing import video
+from foajax.viewing.recording import Screens, progress_bar
+from foajax.viewing.scene import _MARGIN, _TOP, Scene, _dim
+from foajax.viewing.style import NATURAL, RINGS
 
 
 def rgb(colour):
@@ -69,12 +70,12 @@ def test_the_command_writes_an_mp4_at_the_games_speed(breakout_agent, tmp_path, 
 
 
 def test_a_gif_has_the_same_speed(recording, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(render, "_GIF_STEPS", 20)
+    monkeypatch.setattr(video, "_GIF_STEPS", 20)
     first = Screens()
     for screen in recording.screens[:24]:
         first.append(screen)
-    with render.progress_bar() as bar:
-        render.write_video(recording._replace(screens=first), tmp_path / "game.gif", bar)
+    with progress_bar() as bar:
+        video.write_video(recording._replace(screens=first), tmp_path / "game.gif", bar)
     with Image.open(tmp_path / "game.gif") as image:
         durations = []
         for i in range(image.n_frames):

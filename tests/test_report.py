@@ -12,10 +12,12 @@ import yaml
 from browser import browser_needed, opened_page
 from PIL import Image
 
-from foajax import cli, curves, heatmap, report
-from foajax.compose import compose
-from foajax.config import ConfigError, to_mapping
-from foajax.heatmap import HeatMap
+from foajax import cli, report
+from foajax.config.compose import compose
+from foajax.config.parse import ConfigError, to_mapping
+from foajax.reporting import curves, groups, report_page
+from foajax.viewing import heatmap
+from foajax.viewing.heatmap import HeatMap
 
 SMALL = ["network.dense=8", "network.lstm=8"]
 
@@ -69,22 +71,22 @@ def test_a_band_is_the_mean_where_all_seeds_have_scores(tmp_path):
 
 
 def test_seeds_are_grouped_and_final_scores_are_the_evaluated_ones(runs):
-    games = report.games_of(map(curves.read_run, runs), None)
+    games = groups.games_of(map(curves.read_run, runs), None)
     assert {game: {name: len(seeds) for name, seeds in groups.items()} for game, groups in games.items()} == {
         "seek": {"constant70_p_packed": 2, "constant50_sub2_packed": 2}
     }
-    scores = report.final_scores(games["seek"])
+    scores = groups.final_scores(games["seek"])
     assert scores["constant50_sub2_packed"].value == pytest.approx((11.0 + 4.0) / 2)
     assert scores["constant70_p_packed"].value == pytest.approx(6.5)
-    assert report.all_games(games) == {}  # one game needs no normalising
+    assert groups.all_games(games) == {}  # one game needs no normalising
 
 
 def test_all_games_are_normalised_and_only_for_who_played_all(tmp_path):
     for game, score in (("seek", 6.0), ("pong", 14.6)):
         make_run(tmp_path, game, words=[f"game={game}"], scores=[score])
     make_run(tmp_path, "other", words=["game=pong", "experiment=nonfoa"], scores=[0.0])
-    games = report.games_of(map(curves.read_run, sorted(tmp_path.iterdir())), None)
-    together = report.all_games(games)
+    games = groups.games_of(map(curves.read_run, sorted(tmp_path.iterdir())), None)
+    together = groups.all_games(games)
     assert list(together) == ["constant70"]
     assert together["constant70"].value == pytest.approx((0.5 + 1) / 2)
 
@@ -111,12 +113,12 @@ def test_a_preset_has_the_papers_order_and_names(tmp_path):
     for name in ("constant70", "nonfoa", "decreasing", "constant50_sub1_packed"):
         make_run(tmp_path, name, words=["game=seek", f"experiment={name}"], scores=[1.0])
     every = [curves.read_run(run) for run in sorted(tmp_path.iterdir())]
-    assert list(report.games_of(every, "constant")["seek"]) == [
+    assert list(groups.games_of(every, "constant")["seek"]) == [
         "Non-FoA, sub1",
         "Constant 50x50, sub1, packed",
         "Constant 70x70, sub2",
     ]
-    assert list(report.games_of(every, "decreasing")["seek"]) == ["Constant 70x70, sub2", "Decreasing 30-50-70"]
+    assert list(groups.games_of(every, "decreasing")["seek"]) == ["Constant 70x70, sub2", "Decreasing 30-50-70"]
 
 
 def test_what_a_preset_leaves_out_is_named(tmp_path, capsys):
@@ -131,7 +133,7 @@ def test_what_a_preset_leaves_out_is_named(tmp_path, capsys):
 def test_the_page(runs, tmp_path, capsys, monkeypatch):
     counted = {"pixels_actual": 625, "pixels_ratio": 0.0977, "torso_flops": 12e6, "decision_flops": 13e6}
     monkeypatch.setattr(
-        report.cost,
+        report_page.cost,
         "measure_decisions",
         lambda configs, repeats: [counted | {"decision_us_batch1": 950.0}] * len(configs),
     )
@@ -162,25 +164,25 @@ def test_the_page_is_whole_in_a_browser(runs, tmp_path):
 
 
 def test_a_sweeps_directories_are_runs_and_twice_the_same_is_one(tmp_path, capsys):
-    run = make_run(tmp_path, "seek-small-learner.epochs=3-s0", words=["game=seek"], scores=[1.0, 2.0])
+    run = make_run(tmp_path, "seek-small-learner.num_epochs=3-s0", words=["game=seek"], scores=[1.0, 2.0])
     words = [str(run), f"{run}/", f"out={tmp_path / 'out'}", "episodes=0", "repeats=0"]
     assert cli.run(report.report, words) == 0, capsys.readouterr().err
     page = (tmp_path / "out" / "index.html").read_text()
-    assert "learner.epochs=3" in page and "2 seeds" not in page
+    assert "learner.num_epochs=3" in page and "2 seeds" not in page
 
 
 def test_an_evaluation_of_an_earlier_checkpoint_is_named(tmp_path):
     run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0])
     for env_steps, said in ((2000, "evaluated"), (1000, "evaluated at 1,000 env_steps")):
         (run / "score.json").write_text(json.dumps({"mean": 1.5, "env_steps": env_steps}))
-        assert report._origin(curves.read_run(run)) == said
+        assert report_page._origin(curves.read_run(run)) == said
 
 
 def test_greedy_games_are_named(tmp_path):
     run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0])
     for env_steps, said in ((2000, "evaluated, greedy"), (1000, "evaluated at 1,000 env_steps, greedy")):
         (run / "score.json").write_text(json.dumps({"mean": 1.5, "env_steps": env_steps, "policy": "greedy"}))
-        assert report._origin(curves.read_run(run)) == said
+        assert report_page._origin(curves.read_run(run)) == said
 
 
 UNKNOWN = {"env_steps": None, "policy": None, "whole_games": None}  # from before it was kept
@@ -204,10 +206,10 @@ def test_a_heat_map_of_something_else_is_made_again(tmp_path, monkeypatch, chang
     store_map(run, dataclasses.replace(CURRENT, **change))
     if checkpoint is not None:
         (run / "checkpoints" / str(checkpoint)).mkdir(parents=True)
-    monkeypatch.setattr(report, "_make_map", lambda run, episodes: dataclasses.replace(CURRENT, games=episodes))
-    games = report.games_of([curves.read_run(run)], None)
-    assert report.find_maps(games, 9)[run].games == (4 if kept else 9)
-    assert (run in report.find_maps(games, 0)) == kept
+    monkeypatch.setattr(report_page, "_make_map", lambda run, episodes: dataclasses.replace(CURRENT, games=episodes))
+    games = groups.games_of([curves.read_run(run)], None)
+    assert report_page.find_maps(games, 9)[run].games == (4 if kept else 9)
+    assert (run in report_page.find_maps(games, 0)) == kept
 
 
 @pytest.mark.parametrize(
@@ -217,23 +219,23 @@ def test_a_heat_map_of_something_else_is_made_again(tmp_path, monkeypatch, chang
 def test_a_heat_map_that_was_made_on_purpose_is_not_overwritten(tmp_path, monkeypatch, change, replaced):
     run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0, 3.0])
     store_map(run, dataclasses.replace(CURRENT, **change))
-    monkeypatch.setattr(report, "load_agent", lambda path: None)
-    monkeypatch.setattr(report, "play", lambda *_, **__: iter(()))
+    monkeypatch.setattr(report_page, "load_agent", lambda path, trust: None)
+    monkeypatch.setattr(report_page, "play", lambda *_, **__: iter(()))
     monkeypatch.setattr(heatmap, "heat_map", lambda recordings: CURRENT)
     before = heatmap.read(run / "render" / heatmap.FILE).to_json()
-    assert report.find_maps(report.games_of([curves.read_run(run)], None), 1)[run] is CURRENT
+    assert report_page.find_maps(groups.games_of([curves.read_run(run)], None), 1)[run] is CURRENT
     assert heatmap.read(run / "render" / heatmap.FILE).to_json() == (CURRENT.to_json() if replaced else before)
 
 
 def test_a_run_that_cannot_play_has_no_heat_map(tmp_path, capsys):
     run = make_run(tmp_path, "kept", words=["game=seek"], scores=[1.0])
-    assert report.find_maps(report.games_of([curves.read_run(run)], None), 1) == {}
+    assert report_page.find_maps(groups.games_of([curves.read_run(run)], None), 1) == {}
     assert capsys.readouterr().err.startswith(f"no heat map: run={run}: agent.json is missing")
 
 
 def test_no_game_is_played_for_a_page_that_cannot_be_written(tmp_path, monkeypatch, capsys):
     run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0])
-    monkeypatch.setattr(report, "_make_map", lambda run, episodes: pytest.fail("played"))
+    monkeypatch.setattr(report_page, "_make_map", lambda run, episodes: pytest.fail("played"))
     assert cli.run(report.report, [str(run), f"out={run / 'config.yaml'}"]) == 2
     assert "accepted is a directory that can be written" in capsys.readouterr().err
 
@@ -243,17 +245,17 @@ def test_seeds_may_differ_in_what_does_not_matter_only(tmp_path):
     one = make_run(tmp_path, "one", words=["game=seek"], scores=[1.0])
     two = make_run(tmp_path, "two", words=["game=seek", "seed=1", *alike], scores=[1.0])
     other = make_run(tmp_path, "other", words=["game=seek", "seed=2", "train.init_from=agents/a"], scores=[1.0])
-    assert report.games_of(map(curves.read_run, (one, two)), None)
+    assert groups.games_of(map(curves.read_run, (one, two)), None)
     with pytest.raises(ConfigError, match="differs in train.init_from"):
-        report.games_of(map(curves.read_run, (one, other)), None)
+        groups.games_of(map(curves.read_run, (one, other)), None)
 
 
 def test_runs_that_differ_need_names_that_differ(tmp_path):
     one = make_run(tmp_path, "a", words=["game=seek"], scores=[1.0])
     two = make_run(tmp_path, "b", words=["game=seek", "seed=1", "learner.learning_rate=2e-3"], scores=[1.0])
     same = make_run(tmp_path, "c", words=["game=seek", "seed=2"], scores=[1.0])
-    with pytest.raises(report.ConfigError, match=f"{two}: .* differs in learner.learning_rate from that of {one}"):
-        report.games_of(map(curves.read_run, (one, same, two)), None)
+    with pytest.raises(ConfigError, match=f"{two}: .* differs in learner.learning_rate from that of {one}"):
+        groups.games_of(map(curves.read_run, (one, same, two)), None)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,9 @@ import pytest
 from PIL import Image
 
 from foajax import cli, show
-from foajax.config import LogPolarSensor, RingSensor
+from foajax.config.compose import compose
+from foajax.config.schema import LogPolarSensor, RingSensor
+from foajax.viewing import sheet
 
 CANVAS = RingSensor(rings=((20, 20, 2), (40, 40, 4)))
 PACKED = RingSensor(rings=((20, 20, 2), (40, 40, 4)), peripheral=(5, 5), layout="packed")
@@ -19,7 +21,7 @@ def levels(panel):
 
 
 def test_the_panels_of_a_canvas():
-    marked, seen = show._panels(FRAME, CANVAS, (30, 50))
+    marked, seen = sheet._panels(FRAME, CANVAS, (30, 50))
     assert marked[0] == "frame, gaze at y 30, x 50"
     assert marked[1].size == seen[1].size == (240, 240)  # three pixels for one
     white = FRAME.max()
@@ -31,7 +33,7 @@ def test_the_panels_of_a_canvas():
 
 
 def test_the_rings_are_drawn_where_the_areas_end():
-    image = np.asarray(show._marked(np.zeros((80, 80), np.float32), CANVAS, (30, 50)))
+    image = np.asarray(sheet._marked(np.zeros((80, 80), np.float32), CANVAS, (30, 50)))
     inner, outer = (255, 176, 0), (47, 184, 255)
     assert {tuple(c) for c in image.reshape(-1, 3)} == {(0, 0, 0), inner, outer}
     for colour, top, left, side in ((outer, 10, 30, 40), (inner, 20, 40, 20)):
@@ -41,7 +43,7 @@ def test_the_rings_are_drawn_where_the_areas_end():
 
 
 def test_a_retina_is_drawn_as_a_circle():
-    image = np.asarray(show._marked(np.zeros((80, 80), np.float32), LogPolarSensor(radius=20.0), (40, 40)))
+    image = np.asarray(sheet._marked(np.zeros((80, 80), np.float32), LogPolarSensor(radius=20.0), (40, 40)))
     rows, columns = np.nonzero(image[..., 0])
     distance = np.hypot(rows + 0.5 - 120, columns + 0.5 - 120)
     assert ((abs(distance - 59) < 2.5) | (distance < 8)).all()  # the circle, and the cross in its middle
@@ -49,22 +51,22 @@ def test_a_retina_is_drawn_as_a_circle():
 
 
 def test_a_packed_layout_shows_its_images():
-    panels = show._panels(FRAME, PACKED, (40, 40))
+    panels = sheet._panels(FRAME, PACKED, (40, 40))
     captions = [caption for caption, _ in panels[2:]]
     assert captions == ["image 0: 10 x 10", "image 1: 10 x 10", "image 2: 5 x 5"]
     mean = FRAME[30:32, 30:32].mean() / FRAME.max()
     assert (levels(panels[2])[:24, :24] == round(255 * mean)).all()
-    assert len(show._panels(FRAME, LogPolarSensor(rings=8, wedges=8), (40, 40))) == 3
+    assert len(sheet._panels(FRAME, LogPolarSensor(rings=8, wedges=8), (40, 40))) == 3
 
 
 def test_a_black_frame_is_drawn():
-    (_, marked), (_, seen) = show._panels(np.zeros((80, 80), np.float32), CANVAS, (40, 40))
+    (_, marked), (_, seen) = sheet._panels(np.zeros((80, 80), np.float32), CANVAS, (40, 40))
     assert np.asarray(seen).max() == 0 < np.asarray(marked).max()
 
 
 def test_a_row_for_each_focal_point():
-    one = show.draw(FRAME, CANVAS, [(40, 40)], name="mine")
-    two = show.draw(FRAME, CANVAS, [(40, 40), (30, 30)], name="mine")
+    one = sheet.draw(FRAME, CANVAS, [(40, 40)], name="mine")
+    two = sheet.draw(FRAME, CANVAS, [(40, 40), (30, 30)], name="mine")
     assert two.width == one.width
     assert two.height > one.height + 240
     assert (np.asarray(two)[: one.height] == np.asarray(one)).all()
@@ -73,9 +75,9 @@ def test_a_row_for_each_focal_point():
 def test_the_heading_counts_values():
     decreasing = RingSensor(rings=((30, 30, 1), (50, 50, 2), (70, 70, 4)))
     expected = "1,450 values (1,480 shown), 23% of the frame"
-    assert show._heading(FRAME, decreasing, "decreasing") == ("decreasing", expected)
+    assert sheet._heading(FRAME, decreasing, "decreasing") == ("decreasing", expected)
     nonfoa = RingSensor(rings=((80, 80, 1),))
-    assert show._heading(FRAME, nonfoa, "nonfoa") == ("nonfoa", "6,400 values, 100% of the frame")
+    assert sheet._heading(FRAME, nonfoa, "nonfoa") == ("nonfoa", "6,400 values, 100% of the frame")
 
 
 @pytest.fixture
@@ -116,19 +118,19 @@ def test_a_sheet_of_all_sensors(still, tmp_path, capsys, monkeypatch, word):
         lambda frame, sensors, points: names.extend(sensors) or Image.new("RGB", (9, 9)),
     )
     assert cli.run(show.show, [word, f"out={tmp_path / 'sheet.png'}"]) == 0
-    assert names == [*show.PAPER, "logpolar"]
+    assert names == [*sheet.PAPER, "logpolar"]
     assert len(still) == 1  # all look at the same frame
 
 
 def test_the_sheet_is_two_abreast():
-    pair = show.contact_sheet(FRAME, {"a": CANVAS, "b": PACKED}, [(40, 40)])
-    four = show.contact_sheet(FRAME, {"a": CANVAS, "b": PACKED, "c": CANVAS, "d": CANVAS}, [(40, 40)])
+    pair = sheet.contact_sheet(FRAME, {"a": CANVAS, "b": PACKED}, [(40, 40)])
+    four = sheet.contact_sheet(FRAME, {"a": CANVAS, "b": PACKED, "c": CANVAS, "d": CANVAS}, [(40, 40)])
     assert pair.width == four.width > 4 * 240
     assert four.height > 2 * pair.height
 
 
 def test_a_frame_of_a_game_that_needs_no_emulator():
-    config = show.compose(["game=seek", "sensor=constant70"])
+    config = compose(["game=seek", "sensor=constant70"])
     first, later = show.play(config, 0), show.play(config, 20)
     assert first.shape == (80, 80)
     assert first.max() == 1
@@ -141,10 +143,10 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
     [
         ("sensor=constant71", "sensor=constant71: accepted is one of"),
         ("sensor=rings", "sensor.rings: missing; accepted is sensor.rings=value"),
-        ("sensor.ring=3", "sensor.ring=3: unknown key; accepted are rings, kind, peripheral, layout, pooling"),
+        ("sensor.ring=3", "sensor.ring=3: unknown key; accepted is one of rings, kind, peripheral, layout, pooling"),
         ("sensor=all sensor.layout=packed", "sensor.layout=packed: accepted is a key of one sensor, without sensor=a"),
         ("points=[[40,80]]", "points=[40, 80]: accepted is [y, x] inside the frame, 80x80"),
-        ("points=40", "points=40: accepted is a list of [an integer, an integer]"),
+        ("points=40", "points=40: accepted is a list of [y, x]"),
         ("steps=-1", "steps=-1: accepted is an integer >= 0"),
         ("out=view.gif", "out=view.gif: accepted is a file name that ends in .png"),
         ("out=/nowhere/at/all.png", "out=/nowhere/at/all.png: accepted is a file that can be written"),

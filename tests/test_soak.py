@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "soak.py"
 spec = importlib.util.spec_from_file_location("soak", SCRIPT)

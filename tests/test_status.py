@@ -8,10 +8,12 @@ import time
 import pytest
 from rich.console import Console
 
-from foajax import status
-from foajax.compose import compose
-from foajax.config import ConfigError
-from foajax.rundir import open_run
+from foajax import status as command
+from foajax.config.compose import compose
+from foajax.config.parse import ConfigError
+from foajax.runs import status
+from foajax.runs.directory import open_run
+from foajax.runs.lock import is_held
 
 
 @pytest.fixture
@@ -96,8 +98,8 @@ def test_looking_does_not_keep_a_run_from_starting(start):
     lock.close()
     for _ in range(3):
         with start("a") as run:
-            assert status.rundir.is_held(run.path)
-        assert not status.rundir.is_held(run.path)
+            assert is_held(run.path)
+        assert not is_held(run.path)
 
 
 def test_torn_rows_and_damaged_files_are_survived(start):
@@ -119,19 +121,19 @@ def test_the_command_finds_runs_and_prints_one_table(start, tmp_path, capsys, mo
     assert status.find_runs([tmp_path, tmp_path / "deep"]) == [tmp_path / "a", tmp_path / "deep" / "b"]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
-    status.status(["."])
+    command.status(["."])
     out = capsys.readouterr().out
     assert "2 runs: 2 stopped" in out and "deep/b" in out and "50 %" in out and "3.00" in out
     with pytest.raises(ConfigError, match="nowhere: accepted is a directory"):
-        status.status(["nowhere"])
+        command.status(["nowhere"])
     with pytest.raises(ConfigError, match="every=0.0: accepted is"):
-        status.status([".", "every=0"])
+        command.status([".", "every=0"])
     with pytest.raises(ConfigError, match="evry=1: unknown key"):
-        status.status([".", "evry=1"])
+        command.status([".", "evry=1"])
 
 
 def test_an_empty_table_says_so():
     console = Console(width=100)
     with console.capture() as shown:
-        console.print(status.table([]))
+        console.print(command.table([]))
     assert "no runs yet" in shown.get()

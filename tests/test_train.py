@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from processes import TINY, finish, has_rows, rows, start, wait_for
 
-from foajax.checkpoint import Checkpoints
-from foajax.compose import compose
-from foajax.config import ConfigError
-from foajax.distributed import Job
-from foajax.rundir import load_config, open_run
-from foajax.store import load_agent, save_agent
-from foajax.train import Run, train
+from foajax.config.compose import compose
+from foajax.config.parse import ConfigError
+from foajax.launch.processes import Job
+from foajax.runs.agents import load_agent, save_agent
+from foajax.runs.checkpoints import Checkpoints
+from foajax.runs.directory import load_config, open_run
+from foajax.train import train
+from foajax.training.run import Run
 
 
 def same(one, other):
@@ -77,7 +78,7 @@ def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(brea
     with contextlib.ExitStack() as resources:
         run_dir = resources.enter_context(open_run(config, command=[]))
         run = Run(config, Job(config), run_dir, resources)
-        state, tracker, env_steps = run._state, run._tracker.get_state(), run._env_steps
+        state, tracker, env_steps = run.progress.state, run.progress.tracker.get_state(), run.progress.env_steps
     template = jax.eval_shape(lambda: state)
     saved = Checkpoints(path / "checkpoints", keep=None).restore({"train": template, "collector": []})
     chex.assert_trees_all_equal(state, saved.state["train"])  # optimiser and counters too

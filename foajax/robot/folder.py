@@ -16,14 +16,19 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from foajax import __version__, envs, gaze, logpolar, rundir
-from foajax.agent import Agent
-from foajax.config import Config, ConfigError, LogPolarSensor, to_mapping
-from foajax.foveation import sense
-from foajax.frames import SMALLEST_STD
-from foajax.painting import packed, tables
+from foajax import __version__
+from foajax.config.parse import ConfigError, refuse, to_mapping
+from foajax.config.schema import Config, LogPolarSensor, OwnSensor, RingSensor
+from foajax.envs.atari import is_atari
+from foajax.envs.make import action_names, steps_per_second
+from foajax.learning.agent import Agent
 from foajax.robot import golden, onnx_graph, smaller, stablehlo
-from foajax.store import Stored, load_score
+from foajax.runs import provenance
+from foajax.runs.agents import TrainedAgent, load_score
+from foajax.sensors import gaze, logpolar
+from foajax.sensors.frames import SMALLEST_STD
+from foajax.sensors.reconstruct import tables
+from foajax.sensors.sense import sense
 from foajax.types import FrameStatistics
 
 FORMAT = 1
@@ -40,7 +45,7 @@ _TIMEOUT = 600.0  # seconds that the check may take
 
 
 def write(
-    stored: Stored,
+    stored: TrainedAgent,
     out: Path,
     *,
     source: str,
@@ -63,13 +68,13 @@ def write(
         game cannot be played here; the check fails.
     """
     if out.exists() and not (out.is_dir() and (_is_export(out) or not any(out.iterdir()))):
-        raise ConfigError(f"out={out}: accepted is a new directory, or one that export has written")
-    recorded, provenance = golden.record(stored), _provenance(stored, source, command)
+        raise refuse("out", out, "a new directory, or one that export has written")
+    recorded, origin = golden.record(stored), _provenance(stored, source, command)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as made:
             folder = Path(made) / out.name
-            fill(folder, stored, recorded, provenance, dtype)
+            fill(folder, stored, recorded, origin, dtype)
             found = run_check(folder)
             if with_stablehlo:
                 program = stablehlo.serialise(stored)
@@ -79,12 +84,12 @@ def write(
             for name in sorted(file.name for file in folder.iterdir() if file.is_file()):
                 (folder / name).replace(out / name)  # what else lies there is the user's
     except OSError as error:
-        raise ConfigError(f"out={out}: accepted is a directory that can be written ({error.strerror})") from None
+        raise refuse("out", out, f"a directory that can be written ({error.strerror})") from None
     return found
 
 
 def fill(
-    folder: Path, stored: Stored, recorded: dict[str, Any], provenance: Mapping[str, Any], dtype: str = "float32"
+    folder: Path, stored: TrainedAgent, recorded: dict[str, Any], origin: Mapping[str, Any], dtype: str = "float32"
 ) -> None:
     """Makes the folder, without a check: network, arrays, recorded steps, code, and the facts with all checksums."""
     folder.mkdir()
@@ -96,7 +101,7 @@ def fill(
     for name in CODE:
         shutil.copyfile(Path(__file__).parent / name, folder / name)
     digests = {file.name: digest(file) for file in sorted(folder.iterdir())}
-    more = {"dtype": dtype, "check": CHECKS[dtype], "provenance": provenance, "files": digests}
+    more = {"dtype": dtype, "check": CHECKS[dtype], "provenance": origin, "files": digests}
     text = json.dumps(facts(stored) | more, indent=1)
     (folder / FACTS).write_text(text + "\n", encoding="utf-8")
 
@@ -126,33 +131,35 @@ def _is_export(directory: Path) -> bool:
         return False
 
 
-def facts(stored: Stored) -> dict[str, Any]:
-    """What `agent.py` is told besides arrays."""
+def facts(stored: TrainedAgent) -> dict[str, Any]:
+    """What `agent.py` is told besides arrays; `ConfigError` for a sensor that it does not have."""
     agent = stored.agent
+    if isinstance(agent.config.sensor, OwnSensor):
+        raise refuse("sensor.kind", agent.config.sensor.kind, ("rings", "logpolar"), why="cannot be exported")
     config, network = agent.config, agent.config.network
     width = onnx_graph.side_width(agent)
     last = [agent.num_actions, agent.network.num_vision_actions] if network.last_actions else None
     sees_point = width - sum(last or ()) - network.last_reward > 0
-    names = envs.action_names(config) or tuple(f"action {i}" for i in range(agent.num_actions))
+    names = action_names(config) or tuple(f"action {i}" for i in range(agent.num_actions))
     return {
         "format": FORMAT,
         "game": config.game,
         "experiment": config.name,
         "actions": list(names),
         "visual_actions": list(gaze.NAMES[: config.gaze.actions]),
-        "steps_per_second": envs.steps_per_second(config),
+        "steps_per_second": steps_per_second(config),
         "source": "camera" if agent.crop_top is None else "screen",
         "crop_top": agent.crop_top,
         "frame_shape": list(config.env.frame_shape),
         "normalisation": _normalisation(agent, stored.statistics),
         "sensor": to_mapping(config.sensor),
-        "window": list(config.sensor.window),
-        "gaze": _gaze(config),
+        "window": list(agent.sensor.window),
+        "gaze": _gaze(config, agent.sensor.window),
         "side": {
             "focal_point": network.focal_scale if sees_point else None,
             "last_actions": last,
             "last_reward": network.last_reward,
-            "clip_reward": config.env.clip_rewards and config.game not in envs.OWN,
+            "clip_reward": config.env.clip_rewards and (is_atari(config) or config.game.startswith("gymnasium:")),
         },
     }
 
@@ -163,10 +170,10 @@ def _normalisation(agent: Agent, statistics: FrameStatistics) -> str:
     return "frame" if mode in ("running", "pixel") and not statistics.weight > 0 else mode
 
 
-def _gaze(config: Config) -> dict[str, Any]:
+def _gaze(config: Config, window: tuple[int, int]) -> dict[str, Any]:
     """The gaze with its points moved within bounds."""
     look = config.gaze
-    low, high = gaze.limits(gaze=look, window=config.sensor.window, frame_shape=config.env.frame_shape)
+    low, high = gaze.limits(gaze=look, window=window, frame_shape=config.env.frame_shape)
     path = [np.clip(point, low, high).tolist() for point in look.path]
     start: Any = path[0] if look.mode == "scripted" else look.start
     if start == "centre":
@@ -192,8 +199,10 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
         cell, pixel, share = logpolar.shares(sensor)
         first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
         return found | {"pixel": pixel, "weight": (share / std).astype(np.float32), "first": first}
+    assert isinstance(sensor, RingSensor)
+    packed = agent.sensor.packed
     # A frame of ones shows which blocks a finer ring hides.
-    seen = sense(jnp.ones(shape), jnp.array(shape) // 2, sensor=packed(sensor))
+    seen = sense(jnp.ones(shape), jnp.array(shape) // 2, sensor=packed)
     by_mean = sensor.pooling == "mean"
     for i, (height, width, factor) in enumerate(sensor.rings):
         pixels = np.outer(*(np.minimum(factor, size - np.arange(0, size, factor)) for size in (height, width)))
@@ -206,24 +215,24 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
         found |= {"row_edges": rows, "column_edges": columns, "cell_weight": (1 / std / pixels).astype(np.float32)}
         found["mean_cells"] = sums if by_mean else mean[rows[:-1]][:, columns[:-1]]
     if sensor.layout == "canvas":
-        painting = tables(packed(sensor), shape)
+        painting = tables(packed, shape)
         found |= {"paint_window": painting.window, "paint_background": painting.background}
     return found
 
 
-def _labels(stored: Stored) -> Mapping[str, str]:
+def _labels(stored: TrainedAgent) -> Mapping[str, str]:
     config = stored.agent.config
     return {"game": config.game, "experiment": config.name, "env_steps": str(stored.env_steps)}
 
 
-def _provenance(stored: Stored, source: str, command: Sequence[str]) -> dict[str, Any]:
+def _provenance(stored: TrainedAgent, source: str, command: Sequence[str]) -> dict[str, Any]:
     """Where the agent comes from; the training's commit is that of the run's last start, None of a shipped agent."""
     return {
         "run": source,
         "env_steps": stored.env_steps,
         "score": load_score(source),
-        "trained_with": rundir.last_commit(Path(source)),
-        "exported_with": rundir.commit(),
+        "trained_with": provenance.last_commit(Path(source)),
+        "exported_with": provenance.commit(),
         "foajax": __version__,
         "command": list(command),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),

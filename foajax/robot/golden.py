@@ -7,15 +7,15 @@ import functools
 import jax
 import numpy as np
 
-from foajax import evaluate
-from foajax.gymnasium_env import gray_frames
-from foajax.store import Stored
+from foajax.envs.gymnasium import gray_frames
+from foajax.runs.agents import TrainedAgent
+from foajax.viewing import games
 
 STEPS, GAMES = 200, 2  # a second game begins half way, with memory and gaze reset
 _BLOCK = 5  # pixels of one colour in the images: noise would fill the folder
 
 
-def record(stored: Stored, *, seed: int = 0) -> dict[str, np.ndarray]:
+def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
     """The first `STEPS` / 2 greedy decisions of each of two games, one after the other; each array [STEPS, ...].
 
     `frame` is what the environment shows, uint8, and `is_first` where memory and gaze begin anew. Further arrays
@@ -24,7 +24,7 @@ def record(stored: Stored, *, seed: int = 0) -> dict[str, np.ndarray]:
     Raises:
       ConfigError: the game cannot be played here.
     """
-    environment = evaluate.environment(stored, num_envs=GAMES, seed=seed)
+    environment = games.environment(stored, num_envs=GAMES, seed=seed)
     act = jax.jit(functools.partial(stored.agent.act, greedy=True))
     state, key = stored.agent.initial_state(GAMES), jax.random.key(seed)
     rows: dict[str, list[np.ndarray]] = {}

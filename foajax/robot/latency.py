@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -24,10 +25,13 @@ import numpy as np
 import onnx.utils
 import onnxruntime
 
-from foajax.agent import Agent
-from foajax.config import Config, ConfigError
+from foajax.config.compose import compose
+from foajax.config.parse import refuse
+from foajax.config.schema import Config
+from foajax.learning.agent import Agent
+from foajax.reporting.cost import REFERENCE, count
 from foajax.robot import folder
-from foajax.store import Stored
+from foajax.runs.agents import TrainedAgent
 from foajax.types import SCREEN_SHAPE, FrameStatistics, TimeStep
 
 PARTS = ("frame", "sense", "torso", "network", "screen", "camera", "jax_screen")
@@ -49,15 +53,29 @@ print(json.dumps({"start_s": seconds, "memory_mb": int(peak.split()[1]) / 1024})
 """
 
 
-def measure(configs: Sequence[Config], *, dtype: str, repeats: int) -> list[dict[str, Any]]:
-    """One record per experiment: medians and 99th percentiles in microseconds by `PARTS`, file, memory and start.
+def measure(experiments: Sequence[str], *, torso: str, dtype: str, repeats: int) -> list[dict[str, Any]]:
+    """One record per experiment, and for `nonfoa`: times by `PARTS`, file, memory, start, and estimates of energy.
 
-    `frame` makes a frame of a screen, `sense` looks at it, `torso` is a part of `network`; `screen` and `camera` are
-    whole decisions, and `jax_screen` is JAX's.
+    Times are medians and 99th percentiles in microseconds. `frame` makes a frame of a screen, `sense` looks at it,
+    `torso` is a part of `network`; `screen` and `camera` are whole decisions, and `jax_screen` is JAX's.
 
     Raises:
-      ConfigError: an experiment that does not look at Atari's 80x80 frames.
+      ConfigError: an unknown name, or an experiment that does not look at Atari's 80x80 frames.
     """
+    names = list(dict.fromkeys([*experiments, REFERENCE]))
+    configs = [compose([f"experiment={name}", f"network={torso}"]) for name in names]
+    records = _measure(configs, dtype, repeats)
+    reference = records[names.index(REFERENCE)]
+    for name, config, record in zip(names, configs, records, strict=True):
+        flops = count(config)["decision_flops"]
+        record |= {"experiment": name, "dtype": dtype, "decision_flops": flops}
+        for source, size in (("screen", math.prod(SCREEN_SHAPE)), ("camera", math.prod(_IMAGE))):
+            record[f"{source}_ratio"] = record[f"{source}_us"] / reference[f"{source}_us"]
+            record[f"{source}_energy_estimate_uj"] = 1e6 * energy(flops, record["bytes"], size)
+    return records
+
+
+def _measure(configs: Sequence[Config], dtype: str, repeats: int) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as made:
         stored = [_untrained(config) for config in configs]
         paths = [Path(made) / str(i) for i in range(len(stored))]
@@ -65,8 +83,9 @@ def measure(configs: Sequence[Config], *, dtype: str, repeats: int) -> list[dict
             folder.fill(path, agent, {}, {}, dtype)
         module = _load(paths[0] / "agent.py")
         calls = [_calls(module, path, agent) for path, agent in zip(paths, stored, strict=True)]
-        records = [_process(path) | {"bytes": (path / "policy.onnx").stat().st_size} for path in paths]
-        for record, times in zip(records, _time(calls, repeats), strict=True):
+        records: list[dict[str, Any]] = [_process(path) for path in paths]
+        for path, record, times in zip(paths, records, _time(calls, repeats), strict=True):
+            record["bytes"] = (path / "policy.onnx").stat().st_size
             for part, taken in times.items():
                 record[f"{part}_us"], record[f"{part}_us_p99"] = np.percentile(taken, [50, 99]).tolist()
     return records
@@ -77,16 +96,15 @@ def energy(flops: int, weight_bytes: int, image_bytes: int) -> float:
     return flops * _JOULES_PER_FLOP + (weight_bytes + image_bytes) * _JOULES_PER_BYTE
 
 
-def _untrained(config: Config) -> Stored:
+def _untrained(config: Config) -> TrainedAgent:
     agent = Agent(config, _ACTIONS, _CROP_TOP)
     if config.env.frame_shape != (80, 80):
-        accepted = "experiments with env.frame_shape=[80, 80] where target=onnx"
-        raise ConfigError(f"experiments={config.name}: accepted are {accepted}")
+        raise refuse("experiments", config.name, "experiments with env.frame_shape=[80,80] where target=onnx")
     random, shapes = np.random.default_rng(0), jax.eval_shape(agent.initial_params, jax.random.key(0))
     params = jax.tree.map(lambda shape: jnp.asarray(random.normal(0, 0.05, shape.shape), jnp.float32), shapes)
     empty = agent.initial_statistics()
     statistics = FrameStatistics(mean=empty.mean + 0.3, std=jnp.float32(0.2), weight=jnp.float32(1))
-    return Stored(agent, params, statistics, 0)
+    return TrainedAgent(agent, params, statistics, 0)
 
 
 def _load(file: Path) -> ModuleType:
@@ -103,7 +121,7 @@ def _process(path: Path) -> dict[str, float]:
     return json.loads(ended.stdout)
 
 
-def _calls(module: ModuleType, path: Path, stored: Stored) -> dict[str, Callable[[], Any]]:
+def _calls(module: ModuleType, path: Path, stored: TrainedAgent) -> dict[str, Callable[[], Any]]:
     random = np.random.default_rng(0)
     screen, image = (random.integers(0, 256, shape, np.uint8) for shape in (SCREEN_SHAPE, _IMAGE))
     player, watcher = module.Agent(path), module.Agent(path, source="camera", order="bgr")
@@ -128,7 +146,7 @@ def _calls(module: ModuleType, path: Path, stored: Stored) -> dict[str, Callable
     return calls | {"jax_screen": _jax(stored, screen)}
 
 
-def _jax(stored: Stored, screen: np.ndarray) -> Callable[[], Any]:
+def _jax(stored: TrainedAgent, screen: np.ndarray) -> Callable[[], Any]:
     act, state = jax.jit(stored.agent.act), stored.agent.initial_state(1)
     false = np.zeros(1, bool)
     timestep = TimeStep(screen[None], np.zeros(1, np.float32), is_first=false, is_terminal=false)

@@ -11,6 +11,7 @@ Inputs and outputs are mappings of arrays, [batch, ...]; see `inputs`.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -19,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from foajax.agent import Agent
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError, refuse
+from foajax.learning.agent import Agent
 from foajax.robot.golden import GAMES
-from foajax.store import Stored
-from foajax.types import SCREEN_SHAPE, ActorState, CoreState, TimeStep
+from foajax.runs.agents import TrainedAgent
+from foajax.types import SCREEN_SHAPE, ActorState, TimeStep
 
 FILE = "decide.stablehlo"
 PLATFORMS = ("cpu", "cuda")
@@ -31,7 +32,7 @@ TOLERANCE = 1e-4  # of logits
 Arrays = dict[str, Any]
 
 
-def serialise(stored: Stored) -> bytes:
+def serialise(stored: TrainedAgent) -> bytes:
     """The program, with parameters and frame statistics in it.
 
     Its outputs are `natural_action`, `vision_action`, their logits, `looked_at`, and the next state.
@@ -42,11 +43,11 @@ def serialise(stored: Stored) -> bytes:
         for name, value in inputs(stored.agent, 1).items()
     }
     params, statistics = jax.tree.map(jnp.asarray, (stored.params, stored.statistics))
-    call = jax.jit(functools.partial(_decide, stored._replace(params=params, statistics=statistics)))
+    call = jax.jit(functools.partial(_decide, dataclasses.replace(stored, params=params, statistics=statistics)))
     try:
         return bytes(export.export(call, platforms=PLATFORMS)(given).serialize())
     except ImportError as error:
-        raise ConfigError(f"stablehlo=true: {error.name} is missing; accepted is foajax[robot]") from None
+        raise refuse("stablehlo", True, "foajax[robot]", why=f"{error.name} is missing") from None
 
 
 def inputs(agent: Agent, batch: int) -> Arrays:
@@ -94,9 +95,10 @@ def check(data: bytes, golden: Arrays, agent: Agent) -> float:
     return largest
 
 
-def _decide(stored: Stored, given: Arrays) -> Arrays:
+def _decide(stored: TrainedAgent, given: Arrays) -> Arrays:
+    leaves, structure = jax.tree.flatten(stored.agent.initial_state(1).core_state)
     state = ActorState(
-        core_state=CoreState(cell=given["cell"], hidden=given["hidden"]),
+        core_state=jax.tree.unflatten(structure, [given[f"core_{i}"] for i in range(len(leaves))]),
         focal_point=given["focal_point"],
         age=given["age"],
         last_actions=given.get("last_actions"),
@@ -120,6 +122,6 @@ def _decide(stored: Stored, given: Arrays) -> Arrays:
 
 def _named(state: ActorState) -> Arrays:
     """The state as one mapping."""
-    core: Any = state.core_state
-    named = core._asdict() | {"focal_point": state.focal_point, "age": state.age}
+    core = {f"core_{i}": leaf for i, leaf in enumerate(jax.tree.leaves(state.core_state))}
+    named = core | {"focal_point": state.focal_point, "age": state.age}
     return named if state.last_actions is None else named | {"last_actions": state.last_actions}

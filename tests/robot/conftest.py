@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import sys
 from pathlib import Path
@@ -11,8 +12,8 @@ import numpy as np
 import pytest
 
 import foajax
-from foajax.agent import Agent
-from foajax.compose import compose
+from foajax.config.compose import compose
+from foajax.learning.agent import Agent
 from foajax.types import FrameStatistics, TimeStep
 
 sys.path.insert(0, str(Path(foajax.__file__).parent / "robot"))
@@ -28,7 +29,9 @@ def make_stored(untrained):
         stored = untrained(Agent(compose([*SMALL, *words]), actions, crop_top))
         random, weight = np.random.default_rng(1), np.array(0.5, np.float32)
         mean = np.asarray(random.uniform(0.1, 0.4, np.shape(stored.statistics.mean)), np.float32)
-        return stored._replace(statistics=FrameStatistics(mean=mean, std=np.array(0.1, np.float32), weight=weight))
+        return dataclasses.replace(
+            stored, statistics=FrameStatistics(mean=mean, std=np.array(0.1, np.float32), weight=weight)
+        )
 
     return make
 

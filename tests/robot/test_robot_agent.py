@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax import frames
-from foajax.foveation import sense
-from foajax.gymnasium_env import gray_frames
+from foajax.envs.gymnasium import gray_frames
+from foajax.sensors import frames
+from foajax.sensors.sense import sense
 
 robot = pytest.importorskip("agent", reason="needs the extra robot")
 folder = pytest.importorskip("foajax.robot.folder", reason="needs the extra robot")

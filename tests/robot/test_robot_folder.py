@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -12,9 +13,9 @@ import numpy as np
 import pytest
 
 from foajax import cli, export
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError, replace
 from foajax.robot import golden
-from foajax.store import save_agent
+from foajax.runs.agents import save_agent
 
 folder = pytest.importorskip("foajax.robot.folder", reason="needs the extra robot")
 pytest.importorskip("onnxruntime", reason="needs the extra robot")
@@ -59,7 +60,7 @@ def test_the_folder_is_small_and_says_where_it_comes_from(exported):
     provenance = facts["provenance"]
     assert provenance["env_steps"] == 6179840
     assert provenance["score"]["mean"] == 19.1
-    assert provenance["command"][:3] == ["python", "-m", "foajax.export"]
+    assert provenance["command"][:2] == ["foajax", "export"]
 
 
 def test_the_recorded_steps_are_of_the_game(exported):
@@ -199,12 +200,20 @@ def test_a_directory_that_cannot_be_written_is_one_line(make_stored, tmp_path, m
 def test_what_is_not_installed_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert cli.run(export.export, ["run=agents/pong-nonfoa", "out=robot"]) == 2
-    assert "accepted is an installation of foajax[robot]" in capsys.readouterr().err
+    assert "accepted is foajax[robot]" in capsys.readouterr().err
+
+
+def test_a_sensor_from_elsewhere_is_refused(make_stored):
+    stored = make_stored("experiment=nonfoa")
+    config = replace(stored.agent.config, sensor={"kind": "mine.sensors:Sensor"})
+    agent = dataclasses.replace(stored.agent, config=config)
+    with pytest.raises(ConfigError, match="sensor.kind=mine.sensors:Sensor: cannot be exported; accepted is one of"):
+        folder.facts(dataclasses.replace(stored, agent=agent))
 
 
 def test_statistics_that_have_seen_nothing_are_the_frames_own(untrained):
-    from foajax.agent import Agent
-    from foajax.compose import compose
+    from foajax.config.compose import compose
+    from foajax.learning.agent import Agent
 
     stored = untrained(Agent(compose(["experiment=nonfoa"]), 4, 34))
     assert folder.facts(stored)["normalisation"] == "frame"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax.config import ConfigError
-from foajax.types import CoreState
+from foajax.config.parse import ConfigError, replace
 
 onnx = pytest.importorskip("onnx", reason="needs the extra robot")
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra robot")
@@ -27,6 +28,12 @@ NETWORKS = {
     "no dense layer": ["experiment=constant70_p_packed", "network.dense=0"],
     "norms": ["experiment=constant70_p_packed", "network.dense_norm=true"],
     "no norm": ["experiment=constant70_packed", "network.lstm_norm=false"],
+    "impala": ["experiment=constant50_sub2_packed", "network.torso=impala", "network.widths=[4,8]"],
+    "impala of odd images": ["sensor.rings=[[33,21,1]]", "sensor.layout=packed", "network.torso=impala"],
+    "widths": ["experiment=constant70_packed", "network.widths=[8,8,16]"],
+    "gru": ["experiment=constant70_packed", "network.core=gru"],
+    "mingru": ["experiment=constant70_packed", "network.core=mingru", "network.lstm_norm=false"],
+    "no memory": ["experiment=constant70_packed", "network.core=none"],
     "told nothing": [
         *("experiment=nonfoa", "network.last_actions=false", "network.last_reward=false"),
     ],
@@ -44,13 +51,16 @@ def test_the_graph_is_the_network(words, make_stored):
         found = dict(zip([o.name for o in session.get_outputs()], session.run(None, feed), strict=True))
         images = [jnp.asarray(x).transpose(0, 2, 3, 1)[None] for name, x in feed.items() if name.startswith("image")]
         side = feed.get("side", np.zeros((batch, 0), np.float32))[None]
-        state = CoreState(cell=jnp.asarray(feed["cell"]), hidden=jnp.asarray(feed["hidden"]))
+        leaves, structure = jax.tree.flatten(stored.agent.initial_state(batch).core_state)
+        states = [name for name in ("cell", "hidden") if name in feed]
+        assert len(states) == len(leaves)
+        state = jax.tree.unflatten(structure, [jnp.asarray(feed[name]) for name in states])
         inputs = images, jnp.asarray(side), jnp.zeros((1, batch), bool), state
         output, state = jax.jit(stored.agent.forward)(stored.params, *inputs)
         wanted = {"natural_logits": output.natural_logits[0], "natural_value": output.natural_value[0][:, None]}
         if output.vision_logits is not None:
             wanted |= {"vision_logits": output.vision_logits[0], "vision_value": output.vision_value[0][:, None]}
-        wanted |= {"next_cell": state.cell, "next_hidden": state.hidden}
+        wanted |= dict(zip([f"next_{name}" for name in states], jax.tree.leaves(state), strict=True))
         assert set(found) == set(wanted)
         for name, value in wanted.items():
             np.testing.assert_allclose(found[name], value, atol=1e-5, err_msg=name)
@@ -72,7 +82,7 @@ def test_the_file_says_what_it_is(make_stored):
 def test_a_part_that_nobody_knows_is_refused(make_stored):
     stored = make_stored("experiment=constant70_packed")
     params = {"params": stored.params["params"] | {"attention": {"kernel": np.zeros((2, 2), np.float32)}}}
-    with pytest.raises(ConfigError, match="network: attention/kernel cannot be exported; accepted are lstm cores"):
+    with pytest.raises(ConfigError, match="network: has attention/kernel too; accepted is"):
         onnx_graph.policy(stored.agent, params, {})
 
 
@@ -83,12 +93,14 @@ def test_a_part_that_is_missing_is_refused(make_stored):
         onnx_graph.policy(stored.agent, params, {})
 
 
-def test_another_core_is_refused():
-    class Other:
-        core = "attention"
-
-    with pytest.raises(ConfigError, match="network.core=attention: accepted by export are lstm"):
-        onnx_graph.core(Other())
+@pytest.mark.parametrize("key", ["core", "torso"])
+def test_parts_from_elsewhere_are_refused(key, make_stored):
+    stored = make_stored("experiment=constant70_packed")
+    config = replace(stored.agent.config, network=replace(stored.agent.config.network, **{key: "mine.parts:Part"}))
+    accepted = "lstm, gru, mingru, none" if key == "core" else "nature, a3c, impala"
+    message = f"network.{key}=mine.parts:Part: cannot be exported; accepted is one of {accepted}"
+    with pytest.raises(ConfigError, match=message):
+        onnx_graph.policy(dataclasses.replace(stored.agent, config=config), stored.params, {})
 
 
 def test_16_bits_halve_the_file_and_change_little(make_stored):

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from foajax import cli, cost
-from foajax.compose import compose
-from foajax.config import ConfigError
+from foajax.config.compose import compose
+from foajax.config.parse import ConfigError
 
 latency = pytest.importorskip("foajax.robot.latency", reason="needs the extra robot")
 pytest.importorskip("onnxruntime", reason="needs the extra robot")
@@ -40,8 +40,8 @@ def test_energy_is_of_operations_and_bytes():
 
 def test_other_frames_and_missing_packages_are_one_line(monkeypatch, capsys):
     config = compose(["experiment=nonfoa", "env.frame_shape=[60,60]", "sensor.rings=[[60,60,1]]"])
-    with pytest.raises(ConfigError, match=r"accepted are experiments with env.frame_shape=\[80, 80\]"):
-        latency.measure([config], dtype="float32", repeats=1)
+    with pytest.raises(ConfigError, match=r"accepted is experiments with env.frame_shape=\[80,80\]"):
+        latency._measure([config], "float32", 1)
     monkeypatch.setitem(sys.modules, "foajax.robot.latency", None)
     monkeypatch.delattr("foajax.robot.latency", raising=False)
     assert cli.run(cost.cost, ["target=onnx", "experiments=nonfoa"]) == 2

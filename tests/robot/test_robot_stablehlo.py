@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from foajax.config import ConfigError
+from foajax.config.parse import ConfigError
 from foajax.robot.golden import GAMES
 from foajax.types import TimeStep
 

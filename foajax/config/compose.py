@@ -1,0 +1,149 @@
+"""From `key=value` words to a checked `Config`, by way of experiments/ and of a directory of one's own.
+
+Hydra and OmegaConf take a third of a second to import, so that is left to the functions that need them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import yaml
+
+from foajax.config.parse import Section, one_line, refuse
+from foajax.config.schema import RENAMED, Config, LogPolarSensor, RingSensor, from_mapping, renamed
+from foajax.config.shipped import experiments
+from foajax.config.table import defaults
+
+_KINDS: dict[str, type[Section]] = {
+    "rings": RingSensor,
+    "logpolar": LogPolarSensor,
+}  # sensors of one's own, by themselves
+_WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave out
+
+
+def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
+    """The run that `overrides` describe, e.g. `["experiment=nonfoa", "game=pong"]`, from any directory.
+
+    Args:
+      overrides: words as on a command line.
+      config_dir: a directory with more choices: experiment/, sensor/, gaze/, network/, learner/.
+
+    Raises:
+      ConfigError: an unknown key or choice, a malformed override, or a value of the wrong type or range.
+    """
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    words = [checked(word, sweep=False, config_dir=config_dir) for word in overrides]
+    place = "" if config_dir is None else str(Path(config_dir).absolute()).replace("'", "\\'")
+    more = [f"hydra.searchpath=['file://{place}']"] if place else []
+    register()
+    outer = GlobalHydra.instance().hydra  # of an application that uses this package
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(experiments()), version_base="1.3"):
+            node = hydra.compose("base", [*words, *more])
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError, LookupError) as error:
+        raise refuse(one_line(*overrides), why=_first_line(error)) from None
+    finally:
+        GlobalHydra.instance().hydra = outer
+    return from_node(node, words)
+
+
+def register() -> None:
+    """Tells Hydra what is in no file: the keys' defaults, sensors without a canvas, an experiment for each sensor."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance().store
+    store("foajax_keys", defaults(Config))
+    for name, cls in _KINDS.items():
+        store(name, defaults(cls), group="sensor")
+    for name in _packed():
+        store(name, {"defaults": [name.removesuffix("_packed")], "layout": "packed"}, group="sensor")
+    for name in (*_rings(), *_packed()):
+        node = {"defaults": [{"override /sensor": name}], "name": name}
+        store(name, node, group="experiment", package="_global_")
+
+
+def list_experiments() -> list[str]:
+    """What `experiment=` accepts, sorted."""
+    return list(choices()["experiment"])
+
+
+def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> str:
+    """An override as Hydra is to read it. What is wrong with one alone is found here, to name it."""
+    override = parse_override(word)
+    key, value = override.key_or_group, override.value()
+    if override.is_delete() or override.package is not None or not key:
+        raise refuse(one_line(word))
+    if override.is_hydra_override():
+        raise refuse(one_line(word), accepted="the same with --multirun")
+    text = override.get_value_string()
+    offered = choices(config_dir)
+    if override.is_sweep_override():
+        if not sweep:
+            raise refuse(one_line(word), accepted="one value (more with --multirun)")
+    elif key in offered and value not in offered[key]:
+        raise refuse(one_line(word), accepted=offered[key], near=str(value))
+    # With ++ an unknown key reaches `from_mapping`, which can say which keys there are.
+    for old, new in RENAMED.items():
+        text = text.replace(f"${{{old}}}", f"${{{new}}}")
+    return f"{key}={text}" if key in offered else f"++{RENAMED.get(key, key)}={text}"
+
+
+def parse_override(word: str) -> Any:
+    """One word as Hydra's parser understands it."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException:
+        raise refuse(one_line(word), accepted="key=value, or key='value' to quote it") from None
+
+
+def from_node(node: Any, words: Collection[str] = ()) -> Config:
+    """A checked `Config` from an OmegaConf node. What `words` of a command line set stands above words of before."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+    try:
+        stated = {word.lstrip("+").partition("=")[0] for word in words}
+        plain = renamed(cast(dict, OmegaConf.to_container(node)), stated)  # before a key follows another
+        node = OmegaConf.create(plain)
+        return from_mapping(OmegaConf.to_container(node, resolve=True, throw_on_missing=True))
+    except MissingMandatoryValue as error:
+        raise refuse(str(error.full_key), accepted=f"{error.full_key}=value", why="missing") from None
+    except OmegaConfBaseException as error:
+        accepted = "a value or ${key} with another key's name"
+        raise refuse(str(error.full_key), accepted=accepted, why=_first_line(error)) from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]
+
+
+@functools.cache
+def _rings() -> tuple[str, ...]:
+    """The paper's sensors but for the whole frame."""
+    return tuple(sorted(file.stem for file in experiments().glob("sensor/*.yaml") if file.stem != _WHOLE))
+
+
+def _packed() -> tuple[str, ...]:
+    """The same without the canvas around their values."""
+    return tuple(f"{name}_packed" for name in _rings())
+
+
+@functools.cache
+def choices(config_dir: str | Path | None = None) -> dict[str, tuple[str, ...]]:
+    """The names that each group offers: those of experiments/, what is made of them, and those of `config_dir`."""
+    found: dict[str, set[str]] = {"sensor": {*_KINDS, *_packed()}, "experiment": {*_rings(), *_packed()}}
+    for directory in [experiments()] + ([] if config_dir is None else [Path(config_dir)]):
+        for file in directory.glob("*/*.yaml"):
+            found.setdefault(file.parent.name, set()).add(file.stem)
+    return {group: tuple(sorted(names)) for group, names in sorted(found.items())}

@@ -1,0 +1,261 @@
+"""What every group of keys is: a frozen pydantic model, whose mistakes are one line that names key, value and what is
+accepted. The part that knows of no key.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
+
+ABSENT: Any = object()  # no value
+CODE = "package.module:Class"  # the kind of what is code from elsewhere
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be run; the message is one line for the user."""
+
+
+def refuse(
+    key: str,
+    value: object = ABSENT,
+    accepted: str | Iterable[str] = "key=value",
+    *,
+    why: str = "",
+    near: str | None = None,
+    kind: type[ConfigError] = ConfigError,
+) -> ConfigError:
+    """The error, to be raised, about a key's value, or about a word where there is no value.
+
+    Args:
+      key: as the user knows it, e.g. `learner.gamma`.
+      value: what it has.
+      accepted: what it may have, in words, or all of its choices, of which the nearest is suggested.
+      why: what is wrong, where that is not plain.
+      near: what the suggestion has to resemble; null for the value.
+      kind: of error.
+    """
+    given = key if value is ABSENT else f"{key}={brief(value)}"
+    if not isinstance(accepted, str):
+        choices = tuple(accepted)
+        found = difflib.get_close_matches(str(value) if near is None else near, choices, n=1)
+        accepted = f"one of {', '.join(choices)}" + "".join(f" (did you mean {name}?)" for name in found)
+    return kind(f"{given}: {why}{'; ' if why else ''}accepted is {accepted}")
+
+
+def one_line(*parts: object) -> str:
+    """Words, or an error, as they fit into a line."""
+    return " ".join(" ".join(map(str, parts)).split())
+
+
+def file_name(text: str) -> str:
+    """A text as a part of a file's name."""
+    return "".join(c if c.isalnum() or c in "_-." else "-" for c in text)
+
+
+def brief(value: object) -> str:
+    """A value in one line, of 200 characters at most, as a command line has it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    plain = to_mapping(value)
+    text = one_line(plain) or repr(plain)
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+class Frozen(dict):
+    """A mapping that can be hashed, as it does not change."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
+
+    def __reduce__(self) -> tuple:
+        return type(self), (dict(self),)
+
+    def _fixed(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("a configuration does not change")
+
+    __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _fixed
+
+
+def _frozen(value: Any) -> Any:
+    """Lists, as YAML has them, as tuples, and mappings that can be hashed."""
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_frozen, value))
+    return Frozen({key: _frozen(each) for key, each in value.items()}) if type(value) is dict else value
+
+
+class Section(BaseModel):
+    """A group of keys, of which each has a type, bounds, a default and a sentence.
+
+    It is frozen, can be hashed, and is exact: a bool is no int, a string no number; a float may be given as an int and
+    has to fit into float32, a tuple may be given as a list.
+
+    Raises:
+      ConfigError: an unknown or a missing key, or a value of another type or out of range.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
+    prefix: ClassVar[str] = ""  # of the keys' names, where a section is made by itself
+
+    def __init__(self, /, *values: Any, **named: Any) -> None:
+        if len(values) > len(type(self).model_fields):
+            raise TypeError(f"{type(self).__name__} has {len(type(self).model_fields)} keys, not {len(values)}")
+        named = dict(zip(type(self).model_fields, values, strict=False), **named)
+        try:
+            super().__init__(**named)
+        except ValidationError as error:
+            raise _refused(error, type(self), named) from None
+
+    # Sections inside of others are then made without it, and their mistakes come to the outermost, which knows names.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{type(self).__name__}.{name}: is frozen; foajax.config.parse.replace makes another")
+
+    def check(self) -> None:
+        """Raises `ConfigError` where keys do not fit each other, with a key's name in its section."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Any:
+        self.check()
+        return self
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _exact(cls, value: Any, handler: Any) -> Any:
+        found = _frozen(handler(_frozen(value)))
+        if isinstance(found, float) and found != 0 and not 1e-37 <= abs(found) <= 1e38:
+            raise ValueError("a number (0, or of 1e-37 to 1e38)")  # others would be 0 or infinite in float32
+        if isinstance(found, int) and isinstance(value, float):
+            raise ValueError  # 5.0 is equal to a choice of 5
+        return found
+
+
+SectionT = TypeVar("SectionT", bound=Section)
+
+
+def build(cls: type[SectionT], mapping: Any, key: str = "config") -> SectionT:
+    """A section from nested mappings, as of YAML."""
+    if not isinstance(mapping, Mapping):
+        raise refuse(key, mapping, "a mapping")
+    return cls(**{str(name): value for name, value in mapping.items()})
+
+
+def replace(section: SectionT, **changes: Any) -> SectionT:
+    """A section in which some keys have other values, checked."""
+    return type(section)(**{**dict(section), **changes})
+
+
+def to_mapping(value: Any) -> Any:
+    """A section, or a value of one, as plain dicts, lists and scalars."""
+    if isinstance(value, (Section, Mapping)):
+        return {key: to_mapping(each) for key, each in dict(value).items()}
+    return [to_mapping(each) for each in value] if isinstance(value, (list, tuple)) else value
+
+
+def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and their values."""
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            yield from flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+@functools.cache
+def schema_of(cls: type[Section]) -> dict[str, Any]:
+    """The JSON schema of a section."""
+    return cls.model_json_schema()
+
+
+def resolve(node: Mapping[str, Any], root: Mapping[str, Any]) -> dict[str, Any]:
+    """A node of a JSON schema, with what it refers to."""
+    reference = node.get("$ref", "").rpartition("/")[2]
+    return {**root["$defs"][reference], **node} if reference else dict(node)
+
+
+def kinds(node: Mapping[str, Any], root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The sections that a key may hold, by their `kind`, where there are several."""
+    sections = (resolve(each, root) for each in node.get("oneOf", ()))
+    return {each["properties"]["kind"].get("const", CODE): each for each in sections}
+
+
+def describe(node: Mapping[str, Any]) -> str:
+    """What a node of a JSON schema accepts, in words."""
+    if "accepted" in node:
+        return node["accepted"]
+    if "anyOf" in node:
+        return " or ".join(map(describe, node["anyOf"]))
+    if "enum" in node or "const" in node:
+        return "one of " + ", ".join(map(str, node.get("enum", [node.get("const")])))
+    match node.get("type"):
+        case "array" if "prefixItems" in node:
+            return f"[{', '.join(map(describe, node['prefixItems']))}]"
+        case "array":
+            return f"a list of {'at least one ' if node.get('minItems') else ''}{describe(node.get('items', {}))}"
+        case "object" if isinstance(node.get("additionalProperties"), Mapping) and "properties" not in node:
+            return f"a mapping to {describe(node['additionalProperties'])}"
+        case "integer" | "number" as kind:
+            return _describe_number(node, is_integer=kind == "integer")
+    words = {"boolean": "true or false", "string": "a string", "null": "null"}
+    return words.get(node.get("type", ""), "a mapping")
+
+
+def _describe_number(node: Mapping[str, Any], *, is_integer: bool) -> str:
+    if "multipleOf" in node:
+        return f"a multiple of {node['multipleOf']}"
+    name = "an integer" if is_integer else "a number"
+    least, above = node.get("minimum"), node.get("exclusiveMinimum")
+    most, below = node.get("maximum"), node.get("exclusiveMaximum")
+    if least is above is most is below is None:
+        return name if is_integer else f"{name} (0, or of 1e-37 to 1e38)"
+    ends = (above if least is None else least, below if most is None else most)
+    low, high = (str(end) if is_integer or end is None else f"{end:g}" for end in ends)
+    if most is below is None:
+        return f"{name} >{'' if least is None else '='} {low}"
+    if is_integer:
+        return f"{name} from {low} to {high}"
+    return f"{name} in {'(' if least is None else '['}{low}, {high}{')' if most is None else ']'}"
+
+
+def _refused(error: ValidationError, cls: type[Section], data: Mapping[str, Any]) -> ConfigError:
+    """The first of the mistakes that pydantic has found, in our words; unknown keys come before others."""
+    first = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
+    root = schema_of(cls)
+    keys, value, node, around = _find(first["loc"], data, root)
+    prefix = cls.prefix + "".join(f"{key}." for key in keys)
+    name = prefix[:-1] or "config"
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, ConfigError):
+        return ConfigError(f"{prefix}{cause}")
+    if first["type"] == "extra_forbidden":
+        return refuse(name, value, around["properties"], why="unknown key", near=str(keys[-1]))
+    if value is ABSENT:
+        return refuse(name, accepted=describe(node), why="missing")
+    if first["type"] == "union_tag_invalid":
+        return refuse(f"{name}.kind", value.get("kind"), kinds(node, root))
+    return refuse(name, value, str(cause or "") or describe(node))
+
+
+def _find(
+    place: Sequence[int | str], value: Any, root: dict[str, Any]
+) -> tuple[list[str], Any, dict[str, Any], dict[str, Any]]:
+    """The keys that lead to pydantic's place of a mistake, the value there, its schema, and its section's."""
+    keys: list[str] = []
+    node = around = root
+    for part in place[:-2] if place and place[-1] == "[key]" else place:
+        if "oneOf" in node:
+            node = kinds(node, root)[str(part)]
+            continue
+        if "properties" in node:
+            around, node = node, resolve(node["properties"].get(part, {}), root)
+        elif isinstance(node.get("additionalProperties"), dict):
+            node = node["additionalProperties"]
+        else:
+            break
+        keys.append(str(part))
+        value = value.get(part, ABSENT)
+    return keys, value, node, around

@@ -1,0 +1,50 @@
+"""Parts that a configuration names: by a word of ours, or as `package.module:Name` of code from elsewhere."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from foajax.config.parse import one_line, refuse
+
+
+def is_code(name: str) -> bool:
+    """Whether a name is that of code, `package.module:Name`."""
+    return ":" in name
+
+
+def find_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
+    """What makes the part that `key=name` asks for. A name of code imports its module: only what the user trusts.
+
+    Raises:
+      ConfigError: there is no such word, module or name in the module.
+    """
+    if not is_code(name):
+        if name not in ours:
+            raise refuse(key, name, (*ours, "package.module:Name"))
+        return ours[name]
+    module, _, path = name.partition(":")
+    try:
+        found: Any = functools.reduce(getattr, path.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise refuse(key, name, f"package.module:Name ({one_line(error)})") from None
+    if not callable(found):
+        raise refuse(key, name, "package.module:Name of something to call")
+    return found
+
+
+def make_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> Any:
+    """The part itself.
+
+    Raises:
+      ConfigError: as `find_part` does, or it takes other arguments than these.
+    """
+    make = find_part(key, name, ours)
+    try:
+        inspect.signature(make).bind(**arguments)
+    except TypeError as error:
+        raise refuse(key, name, f"a call with {inspect.signature(make)} ({error})") from None
+    return make(**arguments)

@@ -1,0 +1,111 @@
+"""Every key with its default, what it accepts and its sentence: for Hydra, for `--help`, and as docs/keys.md.
+
+`python -m foajax.config.table > docs/keys.md` makes the page anew.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from foajax.config.parse import ABSENT, Section, describe, kinds, resolve, schema_of
+
+_PAGE = """# Keys
+
+Every key of a run, with its default. `python -m foajax.config.table > docs/keys.md` makes this page; the keys stand
+in [schema.py](../foajax/config/schema.py). A group's choice, such as `learner=paper`, changes some of them.
+"""
+
+
+class Key(NamedTuple):
+    """A key as it is shown."""
+
+    name: str  # dotted
+    default: Any  # ABSENT where it has to be given
+    accepted: str
+    sentence: str
+
+    @property
+    def word(self) -> str:
+        """The key with its default, as it is typed."""
+        plain = self.default if isinstance(self.default, str) else None
+        return f"{self.name}={'required' if self.default is ABSENT else plain or json.dumps(self.default)}"
+
+
+class Group(NamedTuple):
+    """The keys of one section."""
+
+    name: str  # dotted; empty for the outermost
+    kind: str  # where its keys depend on that
+    sentence: str
+    keys: list[Key]
+
+
+def groups(cls: type[Section]) -> Iterator[Group]:
+    """The keys of a section and of those inside it, in their order."""
+    root = schema_of(cls)
+    return _groups(root, root)
+
+
+def _groups(node: Mapping[str, Any], root: Mapping[str, Any], name: str = "", kind: str = "") -> Iterator[Group]:
+    keys, inner = [], []
+    for word, child in node["properties"].items():
+        child, dotted = resolve(child, root), f"{name}.{word}".removeprefix(".")
+        if several := kinds(child, root):
+            inner += [(each, root, dotted, which) for which, each in several.items()]
+        elif "properties" in child:
+            inner.append((child, root, dotted, ""))
+        else:
+            default = node.get("default", {}).get(word, child.get("default", ABSENT))
+            if "follows" in node:
+                default = f"${{{node['follows']}.{word}}}"
+            keys.append(Key(dotted, default, describe(child), child.get("description", "")))
+    yield Group(name, kind, node.get("description", "").partition("\n\n")[0], keys)
+    for arguments in inner:
+        yield from _groups(*arguments)
+
+
+def defaults(cls: type[Section]) -> dict[str, Any]:
+    """The defaults as nested mappings, as Hydra has them: `???` where there is none; without what comes in kinds."""
+    found: dict[str, Any] = {}
+    for group in groups(cls):
+        section = found
+        for name in group.name.split(".") if group.name and not group.kind else ():
+            section = section.setdefault(name, {})
+        for key in group.keys if not group.kind else ():
+            section[key.name.rpartition(".")[2]] = "???" if key.default is ABSENT else key.default
+    return found
+
+
+def listed(cls: type[Section]) -> str:
+    """The keys for a terminal, a line each."""
+    lines = []
+    for group in groups(cls):
+        if group.name:
+            lines.append(f"{group.name}{group.kind and f', kind={group.kind}'}: {group.sentence}")
+        lines += [f"  {key.word}  {key.sentence} Accepted: {key.accepted}." for key in group.keys]
+    return "\n".join(lines)
+
+
+def page(cls: type[Section]) -> str:
+    """The keys as a page in Markdown, a table for each section."""
+    lines = [_PAGE]
+    for group in groups(cls):
+        heading = f"## {group.name}{group.kind and f', kind={group.kind}'}" if group.name else "## The run"
+        lines += [heading, group.sentence, "", "| key | accepted | meaning |", "|---|---|---|"]
+        for key in group.keys:
+            cells = map(_cell, (f"`{key.word}`", key.accepted, key.sentence))
+            lines.append(f"| {' | '.join(cells)} |")
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|") if "`" in text else text.replace("|", "\\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    from foajax.config.schema import Config
+
+    print(page(Config))

@@ -1,0 +1,1 @@
+"""The games: one interface, the engines behind it, and tasks of our own."""

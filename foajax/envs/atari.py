@@ -1,0 +1,80 @@
+"""The Atari games, whichever engine plays them.
+
+The Atari engines play the same games, not the same way. Where an episode begins, EnvPool makes its 0 to
+`env.noop_max` no-ops and then one more action, FIRE where the game has it (a no-op where not, or where
+`env.fire_on_reset` is off); ale-py makes FIRE first and counts it among the no-ops. After a lost life EnvPool begins
+with no-ops and FIRE again, ale-py with FIRE alone. Neither can be saved: a resumed run starts new games.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+
+from foajax.config.parse import refuse
+from foajax.config.schema import Config
+from foajax.envs.own import OWN
+
+FRAME_SHAPE = (80, 80)  # of what `frames.crop_and_halve` makes of it
+
+
+def is_atari(config: Config) -> bool:
+    """Whether an emulator plays the game."""
+    return config.game not in OWN and not config.game.startswith("gymnasium:") and not is_own(config)
+
+
+def is_own(config: Config) -> bool:
+    """Whether it is made by code of the user's, `package.module:factory`."""
+    return ":" in config.game and not config.game.startswith(("gymnasium:", "probe:"))
+
+
+def atari_name(game: str, known: Iterable[str]) -> str:
+    """The snake-case name, e.g. beam_rider, of a game given by that name or as EnvPool's BeamRider-v5.
+
+    Raises:
+      ConfigError: if `known` does not have it; the message has the nearest names.
+    """
+    names = {form: name for name in known for form in (name, envpool_id(name))}
+    if game in names:
+        return names[game]
+    near = difflib.get_close_matches(game.lower(), [*names, *OWN], n=3)
+    hint = f"; near: {', '.join(near)}" if near else ""
+    others = f"{', '.join(OWN)}, gymnasium:<id> or package.module:factory"
+    raise refuse("game", game, f"an Atari game (breakout), {others}{hint}")
+
+
+def envpool_id(name: str) -> str:
+    """EnvPool's id of a snake-case name: BeamRider-v5 of beam_rider."""
+    return "".join(part.capitalize() for part in name.split("_")) + "-v5"
+
+
+def check_game(config: Config) -> None:
+    """`ConfigError` where there is no such Atari game, or `env` does not suit it; others show once they are made."""
+    if config.env.kwargs and not (is_own(config) or config.game.startswith("gymnasium:")):
+        raise refuse("env.kwargs", config.env.kwargs, f"{{}} for game={config.game}")
+    if is_atari(config):
+        atari_game(config)
+
+
+def atari_game(config: Config) -> tuple[str, int]:
+    """The engine's name of the game, and the first screen row kept of it."""
+    known: Sequence[str]
+    if config.env.engine == "envpool":
+        from envpool.atari.registration import atari_game_list as known
+    else:
+        from ale_py import roms
+
+        known = roms.get_all_rom_ids()
+    game = atari_name(config.game, known)
+    return game, _crop_top(config, game, known)
+
+
+def _crop_top(config: Config, game: str, known: Iterable[str]) -> int:
+    env = config.env
+    if env.frame_shape != FRAME_SHAPE:
+        shape = list(env.frame_shape)
+        raise refuse("env.frame_shape", shape, f"{list(FRAME_SHAPE)} for game={config.game}")
+    for key, row in env.crop_top.items():
+        if key not in known and key != "default":
+            raise refuse(f"env.crop_top.{key}", row, "default or an Atari game in snake case")
+    return env.crop_top.get(game, env.crop_top["default"])

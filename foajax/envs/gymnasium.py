@@ -1,0 +1,129 @@
+"""Gymnasium's pixel environments as gray frames: `gymnasium:<id>`, the id as `gymnasium.make` takes it.
+
+Of `env` only `frame_shape`, `clip_rewards`, `max_episode_steps` and the constructor's `kwargs` apply; skipped frames,
+no-ops, lives and sticky actions are an emulator's. An id may name the module that registers it, e.g.
+`gymnasium:my_package:MyGame-v0`.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+
+from foajax.config.parse import brief, one_line, refuse
+from foajax.config.schema import Config
+from foajax.types import Outcome, TimeStep
+
+LUMA = np.array([299, 587, 114])  # thousandths of red, green and blue in gray (ITU-R BT.601)
+
+
+class GymnasiumEnvironment:
+    """A batch of one Gymnasium environment, an `envs.Environment`. They step one after another, in `recv`."""
+
+    crop_top: int | None = None
+    lives: np.ndarray | None = None
+
+    def __init__(self, config: Config, *, num_envs: int, seed: int, render: bool) -> None:
+        name = config.game.removeprefix("gymnasium:")
+        if name.count(":") > 1 or name.startswith(":"):
+            raise refuse("game", config.game, "gymnasium:<id> or gymnasium:<module>:<id>")
+        make = functools.partial(gymnasium.make, name, disable_env_checker=True, **config.env.kwargs)
+
+        def make_one() -> gymnasium.Env:
+            env = make()
+            if render and "rgb_array" in (env.metadata.get("render_modes") or ()):
+                env.close()
+                try:
+                    env = make(render_mode="rgb_array")
+                except TypeError:  # it does not take the argument
+                    env = make()
+            return TimeLimit(env, config.env.max_episode_steps)  # beside a limit of its own
+
+        try:
+            self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
+        except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
+            raise refuse("game", config.game, f"the id of an environment ({one_line(error)})") from None
+        observations, actions = self._env.single_observation_space, self._env.single_action_space
+        is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
+        if not (is_pixels and isinstance(actions, spaces.Discrete)):
+            images = "uint8 images [h, w], [h, w, 1] or [h, w, 3]"
+            spaces_here = f"{brief(observations)} and {brief(actions)}"
+            accepted = f"an environment with discrete actions and {images}, not {spaces_here}"
+            raise refuse("game", config.game, accepted)
+        self.num_envs, self.num_actions = num_envs, int(actions.n)
+        self._shape = config.env.frame_shape
+        self._first_action, self._seed, self._clip = int(actions.start), seed, config.env.clip_rewards
+
+    def reset(self) -> tuple[TimeStep, Outcome]:
+        """Begins all episodes, from the seed."""
+        self._image, _ = self._env.reset(seed=self._seed)
+        zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
+        self._ended = false
+        timestep = TimeStep(gray_frames(self._image, self._shape), zeros, is_first=~false, is_terminal=false)
+        return timestep, Outcome(score=zeros, is_over=false)
+
+    def send(self, action: np.ndarray) -> None:
+        """Keeps the actions for `recv`."""
+        self._action = np.asarray(action) + self._first_action
+
+    def recv(self) -> tuple[TimeStep, Outcome]:
+        """Steps every environment."""
+        self._image, score, terminated, truncated, _ = self._env.step(self._action)
+        score = score.astype(np.float32)
+        timestep = TimeStep(
+            frame=gray_frames(self._image, self._shape),
+            reward=np.sign(score) if self._clip else score,
+            is_first=self._ended,
+            is_terminal=terminated.copy(),
+        )
+        self._ended = terminated | truncated
+        return timestep, Outcome(score=score, is_over=self._ended)
+
+    def render(self) -> np.ndarray:
+        """What the environments render, uint8 [B, h, w, 3], of one made with `render`; else their images."""
+        if self._env.render_mode == "rgb_array":
+            return np.stack(self._env.render())
+        image = self._image if self._image.ndim == 4 else self._image[..., None]
+        return np.broadcast_to(image, (*image.shape[:3], 3))
+
+    def close(self) -> None:
+        """Closes every environment."""
+        self._env.close()
+
+
+def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
+    """Images, uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3] (RGB), as frames, uint8 [B, H, W] of `frame_shape`.
+
+    Gray by ITU-R BT.601, resized by area means, each rounded half up: what agents of Gymnasium environments see.
+    `ValueError` for anything else.
+    """
+    if images.dtype != np.uint8 or not (images.ndim == 3 or (images.ndim == 4 and images.shape[-1] in (1, 3))):
+        accepted = "uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3]"
+        raise refuse("images", f"{images.dtype} {list(images.shape)}", accepted)
+    if images.ndim == 4:
+        images = (images @ LUMA + 500) // 1000 if images.shape[-1] == 3 else images[..., 0]
+    rows, columns = (area_weights(*sizes) for sizes in zip(images.shape[1:], frame_shape, strict=True))
+    return np.floor(rows @ images.astype(np.float32) @ columns.T + np.float32(0.5)).astype(np.uint8)
+
+
+@functools.cache
+def area_weights(source: int, target: int) -> np.ndarray:
+    """[target, source] float32: the share of each source pixel in each target pixel, along one axis.
+
+    Target pixel i covers source coordinates [i, i + 1) * source / target: a block mean where target divides source;
+    elsewhere, larger or smaller, border pixels count by the part that is covered. Each row sums to 1.
+    """
+    edges = np.arange(target + 1)[:, None] * source / target
+    pixel = np.arange(source)[None, :]
+    covered = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
+    return (np.maximum(covered, 0) * target / source).astype(np.float32)
+
+
+def _is_image(space: spaces.Box) -> bool:
+    is_gray_or_colour = len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[-1] in (1, 3))
+    return space.dtype == np.uint8 and is_gray_or_colour

@@ -1,0 +1,83 @@
+"""Which environment plays a game, and what is known of it before it is made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from foajax.config.parse import refuse
+from foajax.config.parts import make_part
+from foajax.config.schema import Config
+from foajax.envs.ale import AleEnvironment
+from foajax.envs.atari import atari_name, is_atari, is_own
+from foajax.envs.base import Environment
+from foajax.envs.envpool import EnvPoolEnvironment
+from foajax.envs.gymnasium import GymnasiumEnvironment
+from foajax.envs.own import OWN
+from foajax.envs.tasks import JaxEnvironment
+
+
+def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> Environment:
+    """The environment that plays `config.game`: an Atari game, `seek`, `probe:<name>`, `gymnasium:<id>` or
+    `package.module:factory`.
+
+    Args:
+      config: `game` and `env` are read.
+      num_envs: how many environments step together.
+      seed: environment i is seeded with `seed + i`.
+      render: whether `Environment.render` will be called.
+
+    Raises:
+      ConfigError: if there is no such game, or the engine cannot do what `env` asks.
+    """
+    if is_own(config):
+        arguments = {**config.env.kwargs, "num_envs": num_envs, "seed": seed}
+        made = make_part("game", config.game, {}, **arguments)
+        if not isinstance(made, Environment):
+            raise refuse("game", config.game, "what makes all of a foajax.envs.base.Environment")
+        return made
+    if config.game in OWN:
+        return JaxEnvironment(OWN[config.game](config.env.frame_shape), num_envs=num_envs, seed=seed)
+    if config.game.startswith("gymnasium:"):
+        return GymnasiumEnvironment(config, num_envs=num_envs, seed=seed, render=render)
+    engine = EnvPoolEnvironment if config.env.engine == "envpool" else AleEnvironment
+    return engine(config, num_envs=num_envs, seed=seed, render=render)
+
+
+def action_names(config: Config) -> tuple[str, ...] | None:
+    """The natural actions' names, e.g. ("noop", "fire", "right", "left"); None where they have none.
+
+    Raises:
+      ConfigError: there is no such game.
+    """
+    if config.game == "seek":
+        return ("leave", "take")
+    if not is_atari(config):
+        return None
+    from ale_py import ALEInterface, LoggerMode, roms  # here, like EnvPool
+
+    name = atari_name(config.game, roms.get_all_rom_ids())
+    ALEInterface.setLoggerMode(LoggerMode.Error)
+    emulator = ALEInterface()
+    emulator.loadROM(cast(Path, roms.get_rom_path(name)))
+    return tuple(action.name.lower() for action in emulator.getMinimalActionSet())
+
+
+def steps_per_second(config: Config) -> float:
+    """Agent steps in a second of the game: an Atari console shows 60 frames a second. 15 elsewhere, as with Atari."""
+    return 60 / config.env.frame_skip if is_atari(config) else 15.0
+
+
+def environment_seed(seed: int, env_steps: int, group: int) -> int:
+    """Apart for every run, group and start: an engine adds its environments' numbers to one seed."""
+    return int(np.random.SeedSequence([seed, env_steps, group]).generate_state(1)[0] >> 2)
+
+
+def make_environments(config: Config, env_steps: int, index: int = 0, count: int = 1) -> list[Environment]:
+    """The groups of environments of a run that starts at `env_steps`: process `index`'s part of each, of `count`."""
+    batch = config.env.num_envs // config.env.num_groups // count
+    # An engine adds an environment's number to its seed: each is seeded alike whatever the number of processes.
+    seeds = [environment_seed(config.seed, env_steps, group) + index * batch for group in range(config.env.num_groups)]
+    return [make(config, num_envs=batch, seed=seed) for seed in seeds]

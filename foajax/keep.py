@@ -1,0 +1,39 @@
+"""`python -m foajax.keep run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/<game>/`.
+
+Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
+json=<run>/score.json` has found, and `run.json`: command, commits, seed, machine, hours. Then the tables and the
+learning curves of all kept runs are made anew. Without `run=`, only that.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydantic import Field
+
+from foajax import cli
+from foajax.config.parse import Section, refuse
+from foajax.reporting import kept
+
+
+class Options(Section):
+    """What the command takes."""
+
+    run: str | None = Field(None, description="A run's directory; null to make the tables anew only.")
+    name: str | None = Field(None, description="Directory that it is kept in; null for <experiment>-s<seed>.")
+
+
+def keep(arguments: Sequence[str]) -> None:
+    """The command; prints where a run is kept."""
+    options = cli.parse(Options, arguments)
+    if not kept.KEPT.is_dir():
+        raise refuse(str(kept.KEPT), accepted="a checkout, which has kept runs", why="is missing")
+    if options.run is not None:
+        print(kept.keep(Path(options.run), options.name))
+    kept.write_tables()
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(keep))

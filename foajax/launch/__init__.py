@@ -1,0 +1,1 @@
+"""How runs are started: one, a sweep, or one run in several processes."""

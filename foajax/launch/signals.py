@@ -1,0 +1,46 @@
+"""Requests to stop, which come as signals."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import Any
+
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)  # the last one is a cluster's preemption
+
+
+def signal_in(numbers: bytes) -> str:
+    """The first request to stop among the numbers of signals, if any."""
+    names = [signal.Signals(number).name for number in numbers if number in STOPS]
+    return names[0] if names else ""
+
+
+def arrive_here() -> bool:
+    """Whether this is the main thread, the only one that Python lets handle signals."""
+    return threading.current_thread() is threading.main_thread()
+
+
+class StopRequest:
+    """Turns SIGINT, SIGTERM and SIGUSR1 (a cluster's preemption) into a flag; a second SIGINT interrupts at once.
+
+    In another thread than the main one it hears of none. The handlers from before are back after a `with`.
+    """
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+        self._former: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if arrive_here():
+            self._former = {number: signal.signal(number, self._note) for number in STOPS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.name is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.name = signal.Signals(number).name

@@ -1,0 +1,1 @@
+"""The agent and how it learns: returns, losses, optimiser, and the compiled programs."""

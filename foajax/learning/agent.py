@@ -1,0 +1,236 @@
+"""The agent: preprocess, sense, decide, move the gaze. Pure functions closed over one experiment."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, UInt8
+
+from foajax.config.parse import refuse
+from foajax.config.schema import Config, check_window
+from foajax.learning.losses import log_prob
+from foajax.networks import network as networks
+from foajax.networks.cores import Carry
+from foajax.sensors import frames, gaze
+from foajax.sensors.base import Sensor
+from foajax.sensors.registry import make_sensor
+from foajax.sensors.sense import sense
+from foajax.types import (
+    SCREEN_SHAPE,
+    ActorOutput,
+    ActorState,
+    FrameStatistics,
+    HostArray,
+    NetworkOutput,
+    Params,
+    Rollout,
+    TimeStep,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """What an experiment's agent does; holds no arrays."""
+
+    config: Config
+    num_actions: int  # natural actions of the game
+    crop_top: int | None  # first screen row kept; None where screens are frames already
+
+    def __post_init__(self) -> None:
+        check_window(self.config, self.sensor.window)
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor that the configuration asks for."""
+        return make_sensor(self.config.sensor)
+
+    @property
+    def network(self) -> networks.Network:
+        """The network, without its parameters."""
+        return networks.make_network(self.config, self.num_actions)
+
+    @property
+    def image_shapes(self) -> tuple[tuple[int, int, int], ...]:
+        """Of what the sensor gives of a frame, (h, w, 1) each."""
+        return tuple((*shape, 1) for shape in self.sensor.image_shapes(self.config.env.frame_shape))
+
+    def initial_params(self, key: PRNGKeyArray) -> Params:
+        """Parameters before any learning."""
+        side = self.side(jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2), jnp.int32), jnp.zeros(1), jnp.zeros(1, bool))
+        return networks.initial_params(self.network, key, self.image_shapes, side.shape[-1])
+
+    def initial_statistics(self) -> FrameStatistics:
+        """Frame statistics before any frame."""
+        return frames.initial_statistics(self.config.env.frame_shape if self._by_pixel else ())
+
+    def initial_state(self, batch: int) -> ActorState:
+        """State of `batch` actors before their first episode; `is_first` of the first step completes it."""
+        return ActorState(
+            core_state=networks.initial_core_state(self.network, batch),
+            focal_point=jnp.zeros((batch, 2), jnp.int32),
+            age=jnp.zeros((batch,), jnp.int32),
+            last_actions=jnp.zeros((batch, 2), jnp.int32) if self.config.network.last_actions else None,
+        )
+
+    def act(
+        self,
+        params: Params,
+        statistics: FrameStatistics,
+        state: ActorState,
+        timestep: TimeStep,
+        key: Key[Array, "*actors"],
+        *,
+        greedy: bool = False,
+    ) -> tuple[ActorOutput, NetworkOutput, ActorState]:
+        """One decision of each actor; samples both policies, or takes their modes where `greedy`.
+
+        The visual action chosen here moves the focal point that the *next* frame is sensed at. `key` is one, or one
+        an actor: then what an actor samples does not depend on who the others are.
+        """
+        actors = state.age.shape[0]
+        keys = jax.random.split(key, actors) if key.ndim == 0 else key
+        start_key, natural_key, vision_key = jax.vmap(lambda k: jax.random.split(k, 3), out_axes=1)(keys)
+        frame = self.frame(timestep.frame)
+        if self._by_pixel:
+            frame_mean, frame_std = jax.vmap(lambda f: frames.pixel_statistics(f, statistics))(frame)
+        else:
+            frame_mean, frame_std = jax.vmap(frames.frame_statistics)(frame)
+        frame = self.normalise(frame, statistics)
+        focal_point, age = self.look(start_key, state, timestep)
+        roi = self.sense(frame, focal_point)
+        images = [image[None] for image in roi]
+        reward, is_first = jnp.asarray(timestep.reward), jnp.asarray(timestep.is_first)
+        side = self.side(focal_point, state.last_actions, reward, is_first)
+        output, core_state = self.forward(params, images, side[None], is_first[None], state.core_state)
+        output = jax.tree.map(lambda x: x[0], output)
+        natural_action = _choose(natural_key, output.natural_logits, greedy)
+        vision_action, vision_log_prob = self.choose_vision(vision_key, output, greedy)
+        actor_output = ActorOutput(
+            roi=roi,
+            focal_point=focal_point,
+            natural_action=natural_action,
+            vision_action=vision_action,
+            natural_log_prob=log_prob(output.natural_logits, natural_action),
+            vision_log_prob=vision_log_prob,
+            reward=reward,
+            is_first=is_first,
+            is_terminal=jnp.asarray(timestep.is_terminal),
+            last_actions=state.last_actions,
+            frames=(jnp.mean(frame_mean, axis=0, keepdims=True), jnp.mean(frame_std, keepdims=True)),
+        )
+        told = state.last_actions is not None
+        state = ActorState(
+            core_state=core_state,
+            focal_point=self.move(focal_point, vision_action, age + 1),
+            age=age + 1,
+            last_actions=jnp.stack([natural_action, vision_action], axis=-1) if told else None,
+        )
+        return actor_output, output, state
+
+    def unroll(self, params: Params, rollout: Rollout) -> NetworkOutput:
+        """The network over a whole rollout; each output [T+1, B, ...]."""
+        steps = rollout.steps
+        side = self.side(steps.focal_point, steps.last_actions, steps.reward, steps.is_first)
+        return self.forward(params, list(steps.roi), side, steps.is_first, rollout.core_state)[0]
+
+    def forward(self, params: Params, *inputs: Any) -> tuple[NetworkOutput, Carry]:
+        """The network over T steps; `inputs` are those of `networks.Network`."""
+        return cast(tuple[NetworkOutput, Carry], self.network.apply(params, *inputs))
+
+    def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W"]:
+        """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
+        shape = self.config.env.frame_shape if self.crop_top is None else SCREEN_SHAPE
+        if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
+            accepted = f"uint8 [B, {shape[0]}, {shape[1]}], gray"
+            raise refuse("frame", f"{screen.dtype} {list(screen.shape)}", accepted)
+        return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
+
+    def normalise(self, frame: Float[Array, "B H W"], statistics: FrameStatistics) -> Float[Array, "B H W"]:
+        """Frames with about zero mean and unit deviation, by the configured rule."""
+        mode = self.config.network.normalization
+        return jax.vmap(lambda f: frames.normalise(f, statistics, mode=mode))(frame)
+
+    def look(self, key: Key[Array, "B"], state: ActorState, timestep: TimeStep) -> tuple[Array, Array]:
+        """Focal points to sense this step at, and the actors' ages: both begin anew with an episode."""
+        age = jnp.where(timestep.is_first, 0, state.age)
+        if self.config.gaze.mode == "scripted":
+            return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age), age
+        first = jax.vmap(lambda k: gaze.start(k, **self._gaze))(key)
+        return jnp.where(timestep.is_first[:, None], first, state.focal_point), age
+
+    def move(self, focal_point: Int[Array, "B 2"], vision_action: Int[Array, "B"], age: Int[Array, "B"]) -> Array:
+        """Where the next frame is sensed."""
+        if self.config.gaze.mode == "scripted":
+            return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age)
+        return jax.vmap(lambda p, a: gaze.move(p, a, **self._gaze))(focal_point, vision_action)
+
+    def choose_vision(self, key: Key[Array, "B"], output: NetworkOutput, greedy: bool) -> tuple[Array, Array]:
+        """Visual actions and their log-probabilities: learned, uniformly random, or 0 (stay)."""
+        batch = output.natural_value.shape
+        if output.vision_logits is not None:
+            action = _choose(key, output.vision_logits, greedy)
+            return action, log_prob(output.vision_logits, action)
+        if self.config.gaze.mode == "random":
+            draw = jax.vmap(lambda k: jax.random.randint(k, (), 0, self.config.gaze.actions))
+            return draw(key), jnp.zeros(batch)
+        return jnp.zeros(batch, jnp.int32), jnp.zeros(batch)
+
+    def sense(self, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
+        """The sensor's images of each frame, [B, h, w, 1]."""
+        look = functools.partial(sense, sensor=self.sensor, bounds=self.config.gaze.bounds)
+        return jax.vmap(look)(frame, focal_point)
+
+    def side(
+        self,
+        focal_point: Int[Array, "... 2"],
+        last_actions: Int[Array, "... 2"] | None,
+        reward: Float[Array, "..."],
+        is_first: Bool[Array, "..."],
+    ) -> Float[Array, "... S"]:
+        """What the LSTM is told beside the images, as configured; S may be 0.
+
+        The focal point; then, of the step before, the natural and the visual action as one-hot vectors and the reward
+        that is learned from, all 0 where an episode starts.
+        """
+        parts = [jnp.zeros((*reward.shape, 0))]
+        network = self.config.network
+        if self._sees_focal_point:
+            parts.append(self._scaled(focal_point))
+        going_on = (1.0 - is_first.astype(jnp.float32))[..., None]
+        if network.last_actions and last_actions is not None:
+            counts = (self.num_actions, self.network.num_vision_actions)
+            parts += [going_on * jax.nn.one_hot(last_actions[..., i], n) for i, n in enumerate(counts)]
+        if network.last_reward:
+            parts.append(going_on * reward[..., None])
+        return jnp.concatenate(parts, axis=-1)
+
+    def _scaled(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
+        """Focal points in [-1, 1] of where they can be or, as older agents have them, of the frame."""
+        if self.config.network.focal_scale == "frame":
+            return gaze.to_unit(focal_point, self.config.env.frame_shape)
+        return gaze.to_reach(focal_point, **self._gaze)
+
+    @property
+    def _sees_focal_point(self) -> bool:
+        # A packed image does not tell where it was taken. Nor does a canvas whose normalisation makes 0 of what never
+        # changes, as of what is outside: between two rows of Breakout's empty middle it is the same.
+        config = self.config
+        return not self.sensor.in_place or (config.network.focal_point == "always" and config.gaze.mode != "none")
+
+    @property
+    def _by_pixel(self) -> bool:
+        return self.config.network.normalization == "pixel"
+
+    @property
+    def _gaze(self) -> dict:
+        config = self.config
+        return {"gaze": config.gaze, "window": self.sensor.window, "frame_shape": config.env.frame_shape}
+
+
+def _choose(key: Key[Array, "B"], logits: Float[Array, "B A"], greedy: bool) -> Int[Array, "B"]:
+    action = jnp.argmax(logits, axis=-1) if greedy else jax.vmap(jax.random.categorical)(key, logits)
+    return action.astype(jnp.int32)

@@ -1,0 +1,299 @@
+"""The learner: both heads' losses on a minibatch of environments, and one optimiser step.
+
+Minibatches are applied one after another, as the asynchronous workers' gradients were: a synchronous batch
+would otherwise make `num_envs` times fewer updates a frame than the paper's threads.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from foajax.config.schema import HeadConfig, LearnerConfig
+from foajax.learning import losses, returns
+from foajax.learning.agent import Agent
+from foajax.sensors import frames
+from foajax.types import Params, Rollout, TrainState
+
+Metrics = dict[str, Float[Array, "..."]]
+
+
+def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs, key: PRNGKeyArray) -> TrainState:
+    """State before the first update."""
+    params = agent.initial_params(key)
+    return TrainState(
+        params=params,
+        opt_state=optimizer.init(params),
+        statistics=agent.initial_statistics(),
+        updates=jnp.zeros((), jnp.int32),
+        skipped=jnp.zeros((), jnp.int32),
+    )
+
+
+def minibatch(rollout: Rollout, index: Int[Array, ""], size: int) -> Rollout:
+    """`size` environments of a rollout: every n-th column from `index` on, n = B / size.
+
+    A slice of the rollout that holds a multiple of n environments thus has its share of every minibatch, and which
+    environments meet in one does not depend on how many devices share them. The frames' averages remain the rollout's.
+    """
+
+    def columns(x: Array, axis: int) -> Array:
+        rows = x.reshape(*x.shape[:axis], size, x.shape[axis] // size, *x.shape[axis + 1 :])
+        return jax.lax.dynamic_index_in_dim(rows, index, axis + 1, keepdims=False)
+
+    each = rollout.steps._replace(frames=())
+    return Rollout(
+        steps=jax.tree.map(lambda x: columns(x, 1), each)._replace(frames=rollout.steps.frames),
+        core_state=jax.tree.map(lambda x: columns(x, 0), rollout.core_state),
+    )
+
+
+def loss(
+    params: Params, agent: Agent, rollout: Rollout, *, axis: str | None = None
+) -> tuple[Float[Array, ""], Metrics]:
+    """The paper's total loss (section "Dual-head Loss Function"): both heads' value and policy losses.
+
+    With `axis`, the mesh axis that the environments are spread along, the results are a device's parts of the sums.
+    """
+    config = agent.config.learner
+    output = agent.unroll(params, rollout)
+    steps = rollout.steps
+    # Time is aligned here, once: transition i leads from row i to row i+1.
+    is_terminal_t = steps.is_terminal[1:]
+    mask_t = 1.0 - steps.is_first[1:].astype(jnp.float32)  # the step after an episode's end is nobody's
+    transitions = (steps.reward[1:], is_terminal_t, mask_t)
+
+    heads = [_natural_targets(config.natural, *transitions, output.natural_value)]
+    if output.vision_value is not None:
+        heads.append(_vision_targets(config, *transitions, output.vision_value))
+    masks = [(targets.policy_mask_t, targets.value_mask_t) for targets in heads]
+    valid = _whole(jnp.stack([jnp.stack([losses.valid_steps(mask) for mask in pair]) for pair in masks]), axis)
+    total, metrics = _head_loss(
+        config,
+        config.natural,
+        heads[0],
+        valid[0],
+        logits=output.natural_logits[:-1],
+        value=output.natural_value[:-1],
+        action=steps.natural_action[:-1],
+        behaviour_log_prob=steps.natural_log_prob[:-1],
+        axis=axis,
+    )
+    metrics = {f"natural_{name}": value for name, value in metrics.items()}
+    if output.vision_logits is not None and output.vision_value is not None:
+        vision_total, vision_metrics = _head_loss(
+            config,
+            config.vision,
+            heads[1],
+            valid[1],
+            logits=output.vision_logits[:-1],
+            value=output.vision_value[:-1],
+            action=steps.vision_action[:-1],
+            behaviour_log_prob=steps.vision_log_prob[:-1],
+            axis=axis,
+        )
+        total = total + config.vision_weight * vision_total
+        metrics |= {f"vision_{name}": value for name, value in vision_metrics.items()}
+    return total, metrics | {"loss": total}
+
+
+class Targets(NamedTuple):
+    """What one head learns from, constants to its loss."""
+
+    returns: Float[Array, "T B"]  # n-step
+    advantages: Float[Array, "T B"]
+    policy_mask_t: Float[Array, "T B"]  # 1 where the step enters the policy's loss
+    value_mask_t: Float[Array, "T B"]  # and the value's
+
+
+def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
+    def one(r_t, is_terminal_t, mask_t, v):
+        discount_t = head.gamma * (1.0 - is_terminal_t)
+        return Targets(
+            returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
+            advantages=returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda),
+            policy_mask_t=mask_t,
+            value_mask_t=mask_t,
+        )
+
+    return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
+
+
+def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
+    head = config.vision
+
+    def one(r_t, is_terminal_t, mask_t, v):
+        stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
+        credited = returns.vision_stream(r_t, is_terminal_t, mask_t, credits_last=config.credits_last_gaze)
+        return Targets(
+            returns=returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap),
+            advantages=returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda),
+            policy_mask_t=credited.policy_mask_t,
+            value_mask_t=credited.value_mask_t,
+        )
+
+    return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
+
+
+def _head_loss(
+    config: LearnerConfig,
+    head: HeadConfig,
+    targets: Targets,
+    valid: Int[Array, "2"],
+    *,
+    logits: Float[Array, "T B A"],
+    value: Float[Array, "T B"],
+    action: Int[Array, "T B"],
+    behaviour_log_prob: Float[Array, "T B"],
+    axis: str | None,
+) -> tuple[Float[Array, ""], Metrics]:
+    """One head's policy, value and entropy terms; the only place where they are masked, reduced and weighted.
+
+    `valid` counts the steps that enter the policy's and the value's loss, on all devices.
+    """
+    shards = jax.lax.axis_size(axis) if axis else 1
+    acts, values = (
+        functools.partial(losses.reduce_steps, mask_t=mask, steps=steps, shards=shards)
+        for mask, steps in zip((targets.policy_mask_t, targets.value_mask_t), valid, strict=True)
+    )
+    mean, mean_of_values = (functools.partial(reduce, reduction="mean") for reduce in (acts, values))
+    advantages = targets.advantages
+    target = targets.returns if config.value_target == "n_step" else value + advantages
+    if config.normalize_advantages:
+        centred = advantages - _whole(mean(advantages), axis)
+        advantages = centred / (jnp.sqrt(_whole(mean(centred**2), axis)) + 1e-8)
+    policy = losses.policy_loss(
+        logits, action, advantages, behaviour_log_prob=behaviour_log_prob, clip_ratio=config.clip_ratio
+    )
+    error = losses.value_loss(value, target)
+    entropy = losses.entropy(logits)
+    total = acts(policy - head.entropy_weight * entropy, reduction=config.reduction)
+    total += config.value_weight * values(error, reduction=config.reduction)
+    log_ratio = losses.log_prob(logits, action) - behaviour_log_prob
+    metrics = {
+        "policy_loss": mean(policy),
+        "value_loss": mean_of_values(error),
+        "entropy": mean(entropy),
+        "value": mean_of_values(value),
+        "approx_kl": mean(jnp.expm1(log_ratio) - log_ratio),  # of the policy that acted from today's (Schulman 2020)
+        "policy": jax.vmap(mean, in_axes=-1)(jax.nn.softmax(logits)),
+        "moments": jax.vmap(mean_of_values)(jnp.stack([target, target**2, target - value, (target - value) ** 2])),
+    }
+    if config.clip_ratio is not None:
+        outside = jnp.abs(jnp.expm1(log_ratio)) > config.clip_ratio
+        metrics["clip_fraction"] = mean(outside.astype(jnp.float32))
+    return total, metrics
+
+
+def _whole(parts: Any, axis: str | None) -> Any:
+    """The sums of the devices' parts of a tree, in one exchange: its fixed cost is paid once, not for each array."""
+    if not axis:
+        return parts
+    flat, restore = ravel_pytree(parts)
+    return restore(jax.lax.psum(flat, axis))
+
+
+def _summed_up(metrics: Metrics) -> Metrics:
+    """What only the whole minibatch's means tell, in the place of those means.
+
+    `information`, of each head's mean `policy`: what its decisions tell of what was seen, in nats. The entropy of the
+    mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
+
+    `target_variance` and `error_variance`, of the `moments`: see `explained_variance`.
+    """
+    kept = dict(metrics)
+    # In the mapping's order: in a set's, which no two processes share, they would compile different programs.
+    for head in [name.removesuffix("_policy") for name in metrics if name.endswith("_policy")]:
+        p, moments = kept.pop(f"{head}_policy"), kept.pop(f"{head}_moments")
+        kept[f"{head}_information"] = jnp.sum(jnp.where(p > 0, -p * jnp.log(p), 0.0)) - metrics[f"{head}_entropy"]
+        kept[f"{head}_target_variance"] = moments[1] - moments[0] ** 2
+        kept[f"{head}_error_variance"] = moments[3] - moments[2] ** 2
+    return kept
+
+
+def explained_variance(means: dict[str, float]) -> dict[str, float]:
+    """Updates' mean metrics with each head's 1 - Var(target - value) / Var(target), 1 at best, for both variances.
+
+    Of the means, because a minibatch without any reward has targets that hardly differ.
+    """
+    kept = dict(means)
+    for head in [name.removesuffix("_error_variance") for name in means if name.endswith("_error_variance")]:
+        errors, targets = kept.pop(f"{head}_error_variance"), kept.pop(f"{head}_target_variance")
+        kept[f"{head}_explained_variance"] = 1.0 - errors / max(targets, 1e-12)
+    return kept
+
+
+def observe(state: TrainState, rollout: Rollout, *, axis: str | None = None) -> TrainState:
+    """Takes a rollout's frames into the running statistics and learns nothing.
+
+    The deviation begins anew: what was measured from means that were not known yet is forgotten.
+    """
+    count = rollout.steps.is_first[:-1].size
+    frame_mean, frame_std = (jnp.mean(x[:-1], (0, 1)) for x in rollout.steps.frames)
+    if axis:
+        shards = jax.lax.axis_size(axis)
+        frame_mean, frame_std = _whole((frame_mean / shards, frame_std / shards), axis)
+        count *= shards
+    statistics = frames.update_statistics(state.statistics, frame_mean, frame_std, count)
+    return state._replace(statistics=statistics._replace(std=frame_std * statistics.weight))
+
+
+def update(
+    agent: Agent,
+    optimizer: optax.GradientTransformationExtraArgs,
+    size: int,
+    state: TrainState,
+    rollout: Rollout,
+    index: Int[Array, ""],
+    is_first_pass: Bool[Array, ""],
+    *,
+    axis: str | None = None,
+) -> tuple[TrainState, Metrics]:
+    """One optimiser step on minibatch `index` of a rollout.
+
+    Where the loss or the gradient is not finite, parameters and optimiser stay as they were and the step is counted
+    as skipped. So it is where a new parameter is not, but there the optimiser's averages go on: they have seen a
+    finite gradient, and a step of theirs that is too large gets smaller. Frames enter the running statistics on the
+    first pass over a rollout only.
+
+    With `axis`, a mesh axis, `rollout` is a device's share and `size` its share of a minibatch; the state and the
+    metrics are those of the whole, the same on every device.
+    """
+    part = minibatch(rollout, index, size)
+    frames_seen = part.steps.is_first[:-1].size
+    frame_mean, frame_std = (jnp.mean(x[:-1], (0, 1)) for x in part.steps.frames)
+    results = jax.grad(loss, has_aux=True)(state.params, agent, part, axis=axis)
+    if axis:
+        shards = jax.lax.axis_size(axis)
+        results, frame_mean, frame_std = _whole((results, frame_mean / shards, frame_std / shards), axis)
+        frames_seen *= shards
+    gradient, metrics = results
+    metrics = _summed_up(metrics)
+    grad_norm = optax.tree.norm(gradient)
+    accept = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
+    change, opt_state = optimizer.update(gradient, state.opt_state, state.params, accept=accept)
+    params = optax.apply_updates(state.params, change)
+    param_norm = optax.tree.norm(params)
+    finite = accept & jnp.isfinite(param_norm)
+    params = jax.tree.map(lambda new, old: jnp.where(finite, new, old), params, state.params)
+    opt_state = opt_state._replace(count=state.opt_state.count + finite)
+    most = agent.config.learner.max_grad_norm
+    statistics = frames.update_statistics(state.statistics, frame_mean, frame_std, is_first_pass * frames_seen)
+    skipped = jnp.where(finite, 0, state.skipped + 1)
+    updates = state.updates + 1
+    metrics |= {
+        "grad_norm": grad_norm,
+        "param_norm": param_norm,
+        "clipped": (finite & (grad_norm > (jnp.inf if most is None else most))).astype(jnp.float32),
+        "skipped": 1.0 - finite.astype(jnp.float32),
+        "skipped_in_a_row": skipped,
+        "skipped_updates": updates - opt_state.count,
+    }
+    state = TrainState(params=params, opt_state=opt_state, statistics=statistics, updates=updates, skipped=skipped)
+    return state, metrics

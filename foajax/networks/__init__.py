@@ -1,0 +1,1 @@
+"""The recurrent network with two heads, and the operations that it is made of."""

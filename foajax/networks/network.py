@@ -1,0 +1,100 @@
+"""The network with two heads: torso, core, four outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from foajax.config.schema import Config, NetworkConfig
+from foajax.networks.cores import LSTM, Carry, make_core
+from foajax.networks.torsos import RELU_GAIN, make_torso
+from foajax.types import NetworkOutput, Params
+
+_SMALLEST_IMAGE = 8  # below it (a 5x5 periphery) the values go straight to the next layer
+
+
+class Network(nn.Module):
+    """Torso on every image of the sensor, dense layer, core, natural head and, where gaze is learned, vision head.
+
+    The torso sees all T*B images at once, outside of any loop: convolution gradients inside a loop are slow.
+    """
+
+    config: NetworkConfig
+    num_natural_actions: int
+    num_vision_actions: int  # 0: no vision head (non-FoA, and gaze that is not learned)
+
+    def setup(self) -> None:
+        self.core = make_core(self.config)
+        if isinstance(self.core, LSTM):
+            nn.share_scope(self, self.core)  # agents on disk have its parameters beside the network's own
+
+    @nn.compact
+    def __call__(
+        self,
+        roi: Sequence[Float[Array, "T B _ _ _"]],
+        side: Float[Array, "T B S"],
+        is_first: Bool[Array, "T B"],
+        core_state: Carry,
+    ) -> tuple[NetworkOutput, Carry]:
+        """`side` is what the core is told beside the images, S numbers or none. Each output is [T, B, ...]."""
+        steps, batch = is_first.shape
+        features = self.features([image.reshape(steps * batch, *image.shape[2:]) for image in roi])
+        features = jnp.concatenate([features, side.reshape(steps * batch, side.shape[-1])], axis=-1)
+        hidden, core_state = self.core(features.reshape(steps, batch, -1), is_first, core_state)
+        natural_logits, natural_value = self.head("natural", hidden, self.num_natural_actions)
+        vision_logits, vision_value = None, None
+        if self.num_vision_actions:
+            vision_logits, vision_value = self.head("vision", hidden, self.num_vision_actions)
+        output = NetworkOutput(
+            natural_logits=natural_logits,
+            natural_value=natural_value,
+            vision_logits=vision_logits,
+            vision_value=vision_value,
+        )
+        return output, core_state
+
+    def features(self, images: Sequence[Float[Array, "N _ _ _"]]) -> Float[Array, "N F"]:
+        """What the torso makes of the sensor's images, concatenated; then the dense layer if there is one."""
+        parts = [
+            make_torso(self.config, name=f"torso_{i}")(x)
+            if min(x.shape[1:3]) >= _SMALLEST_IMAGE
+            else x.reshape(x.shape[0], -1)
+            for i, x in enumerate(images)
+        ]
+        features = jnp.concatenate(parts, axis=-1)
+        if self.config.dense:
+            if self.config.dense_norm:  # so that one learning rate suits every sensor, however many features it has
+                features = nn.LayerNorm(use_bias=False, use_scale=False, name="dense_norm")(features)
+            dense = nn.Dense(self.config.dense, kernel_init=nn.initializers.orthogonal(RELU_GAIN), name="dense")
+            features = nn.relu(dense(features))
+        return features
+
+    def head(self, name: str, hidden: Float[Array, "T B L"], actions: int) -> tuple[Array, Array]:
+        """Softmax logits and value. Small first logits: every action is about equally likely at the start."""
+        logits = nn.Dense(actions, kernel_init=nn.initializers.orthogonal(0.01), name=f"{name}_policy")(hidden)
+        value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name=f"{name}_value")(hidden)
+        return logits, value[..., 0]
+
+
+def make_network(config: Config, num_natural_actions: int) -> Network:
+    """The network that an experiment asks for."""
+    return Network(
+        config=config.network,
+        num_natural_actions=num_natural_actions,
+        num_vision_actions=config.gaze.actions if config.gaze.learned else 0,
+    )
+
+
+def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[int, int, int]], side: int) -> Params:
+    """Parameters for images of these shapes (h, w, channels), and `side` numbers beside them."""
+    roi = [jnp.zeros((1, 1, *shape)) for shape in image_shapes]
+    core_state = initial_core_state(network, 1)
+    return network.init(key, roi, jnp.zeros((1, 1, side)), jnp.zeros((1, 1), bool), core_state)
+
+
+def initial_core_state(network: Network, batch: int) -> Carry:
+    """Before the first step of `batch` environments."""
+    return make_core(network.config).initial_state(batch)

@@ -1,0 +1,185 @@
+"""What a decision costs: counted by XLA before it compiles, and timed in turns; `foajax.cost` says what is counted."""
+
+from __future__ import annotations
+
+import functools
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from foajax.config.compose import compose
+from foajax.config.schema import Config
+from foajax.learning.agent import Agent
+from foajax.networks.cores import Carry
+from foajax.networks.torsos import make_torso
+from foajax.types import Params
+
+BATCHES = (1, 32)
+_NUM_ACTIONS = 4  # Breakout's
+REFERENCE = "nonfoa"
+PARTS = ("sense", "network", "decision")
+
+
+class Subject(NamedTuple):
+    """An experiment to be measured."""
+
+    exact: dict[str, Any]  # what is counted
+    calls: dict[str, Callable[[], Any]]  # what is timed, by the name of the result
+
+
+def measure(experiments: Sequence[str], *, torso: str, repeats: int) -> list[dict[str, Any]]:
+    """One record an experiment: what is counted, times in microseconds, ratios to `nonfoa`.
+
+    `nonfoa` is measured in any case, for the ratios.
+
+    Raises:
+      ConfigError: an unknown name.
+    """
+    names = list(dict.fromkeys([*experiments, REFERENCE]))
+    subjects = [_subject(compose([f"experiment={name}", f"network={torso}"])) for name in names]
+    times = _time([subject.calls for subject in subjects], repeats)
+    records = [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
+    reference = records[names.index(REFERENCE)]
+    for record in records:
+        for key in ("torso_flops", "decision_flops", *(f"decision_us_batch{batch}" for batch in BATCHES)):
+            record[f"{key}_ratio"] = record[key] / reference[key]
+    return records
+
+
+def measure_decisions(configs: Sequence[Config], *, repeats: int) -> list[dict[str, Any]]:
+    """For each run what is counted and, timed on this machine, `decision_us_batch1`."""
+    subjects, key = [_subject(config) for config in configs], "decision_us_batch1"
+    times = _time([{key: subject.calls[key]} for subject in subjects], repeats)
+    return [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
+
+
+def sense(agent: Agent, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
+    """The sensor's part of a decision."""
+    return agent.sense(frame, focal_point)
+
+
+def decide(
+    agent: Agent,
+    params: Params,
+    roi: tuple[Float[Array, "B _ _ 1"], ...],
+    focal_point: Int[Array, "B 2"],
+    core_state: Carry,
+    key: PRNGKeyArray,
+) -> tuple[Array, Array, Carry]:
+    """The network's part: torso to sampling, and the gaze's move."""
+    batch = focal_point.shape[0]
+    natural_key, vision_key = jax.random.split(key, (2, batch))
+    images, is_first = [image[None] for image in roi], jnp.zeros(batch, bool)
+    side = agent.side(focal_point, jnp.zeros((batch, 2), jnp.int32), jnp.zeros(batch), is_first)
+    output, core_state = agent.forward(params, images, side[None], is_first[None], core_state)
+    output = jax.tree.map(lambda x: x[0], output)
+    natural_action = jax.vmap(jax.random.categorical)(natural_key, output.natural_logits)
+    vision_action, _ = agent.choose_vision(vision_key, output, False)
+    age = jnp.zeros(batch, jnp.int32)
+    return natural_action, agent.move(focal_point, vision_action, age), core_state
+
+
+def decision(
+    agent: Agent,
+    params: Params,
+    frame: Float[Array, "B H W"],
+    focal_point: Int[Array, "B 2"],
+    core_state: Carry,
+    key: PRNGKeyArray,
+) -> tuple[Array, Array, Carry]:
+    """Both parts as one program."""
+    return decide(agent, params, sense(agent, frame, focal_point), focal_point, core_state, key)
+
+
+def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ 1"], ...]) -> list[Array]:
+    """The convolutions alone, of every image that is large enough for them."""
+    module: Any = make_torso(agent.config.network)
+    weights = {i: params["params"].get(f"torso_{i}") for i in range(len(roi))}
+    return [module.apply({"params": own}, roi[i]) for i, own in weights.items() if own is not None]
+
+
+def flops(function: Callable[..., Any], *arguments: Any) -> int:
+    """Floating-point operations of a call, as XLA counts them before it compiles."""
+    analysis: Any = jax.jit(function).lower(*arguments).cost_analysis()
+    return int(analysis["flops"])
+
+
+def count(config: Config) -> dict[str, Any]:
+    """What is counted of a run's decision: the same on every machine."""
+    return _subject(config).exact
+
+
+def _subject(config: Config) -> Subject:
+    agent = Agent(config, num_actions=_NUM_ACTIONS, crop_top=None)
+    shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
+    random = np.random.default_rng(0)
+    # The values matter to neither count nor time; initialisation as in training is slow to compile.
+    params = jax.tree.map(lambda s: jnp.asarray(random.normal(0, 0.05, s.shape), s.dtype), shapes)
+    calls = {}
+    for batch in BATCHES:
+        for part, call in zip(PARTS, _calls(agent, params, batch), strict=True):
+            calls[f"{part}_us_batch{batch}"] = call
+    return Subject(exact=_count(agent, params), calls=calls)
+
+
+def _count(agent: Agent, params: Params) -> dict[str, Any]:
+    """What is the same on every machine, at batch 1."""
+    config = agent.config
+    frame, focal_point, core_state, key = _inputs(agent, 1)
+    roi = jax.eval_shape(functools.partial(sense, agent), frame, focal_point)
+    pixels = agent.sensor.count(config.env.frame_shape)
+    return {
+        "experiment": config.name,
+        "torso": config.network.torso,
+        "pixels_nominal": pixels.nominal,
+        "pixels_actual": pixels.actual,
+        "pixels_ratio": pixels.actual / math.prod(config.env.frame_shape),
+        "torso_flops": flops(functools.partial(torso, agent), params, roi),
+        "decision_flops": flops(functools.partial(decision, agent), params, frame, focal_point, core_state, key),
+        "params": sum(leaf.size for leaf in jax.tree.leaves(params)),
+    }
+
+
+def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, Carry, Array]:
+    """A batch of frames of noise, the focal points at their centres."""
+    shape = agent.config.env.frame_shape
+    frame = jnp.asarray(np.random.default_rng(0).normal(size=(batch, *shape)), jnp.float32)
+    focal_point = jnp.tile(jnp.array(shape, jnp.int32) // 2, (batch, 1))
+    return frame, focal_point, agent.initial_state(batch).core_state, jax.random.key(0)
+
+
+def _calls(agent: Agent, params: Params, batch: int) -> list[Callable[[], Any]]:
+    """What is timed: sensor, network, and both as one program."""
+    frame, focal_point, core_state, key = _inputs(agent, batch)
+    look, think, both = (jax.jit(functools.partial(part, agent)) for part in (sense, decide, decision))
+    roi = look(frame, focal_point)
+    return [
+        functools.partial(look, frame, focal_point),
+        functools.partial(think, params, roi, focal_point, core_state, key),
+        functools.partial(both, params, frame, focal_point, core_state, key),
+    ]
+
+
+def _time(calls: Sequence[dict[str, Callable[[], Any]]], repeats: int) -> list[dict[str, float]]:
+    """Medians in microseconds; the calls take turns, each after one of its own that is not timed.
+
+    A robot's loop decides again and again: the caches then hold the parameters and the threads are awake.
+    """
+    for call in [call for group in calls for call in group.values()]:
+        jax.block_until_ready(call())  # compiles
+    taken: list[dict[str, list[float]]] = [{name: [] for name in group} for group in calls]
+    for _ in range(repeats):
+        for group, times in zip(calls, taken, strict=True):
+            for name, call in group.items():
+                jax.block_until_ready(call())
+                begin = time.perf_counter()
+                jax.block_until_ready(call())
+                times[name].append(1e6 * (time.perf_counter() - begin))
+    return [{name: statistics.median(values) for name, values in times.items()} for times in taken]

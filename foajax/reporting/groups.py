@@ -1,0 +1,101 @@
+"""Runs by game and experiment: what is a seed of what, how they differ, what they score."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from foajax.config.parse import flatten, refuse, to_mapping
+from foajax.reporting.curves import RunData
+from foajax.reporting.scores import Interval, interval, iqm, normalised
+from foajax.runs.directory import FREE
+
+# Figs. 7 to 9 of the paper: experiments in the order of their legends.
+PRESETS = {
+    "constant": ("nonfoa", "constant50_sub1", "constant50_sub2", "constant70"),
+    "decreasing": ("constant70", "decreasing"),
+    "peripheral": ("constant70_p", "decreasing_p", "constant70", "decreasing"),
+}
+_PAPER_NAMES = {
+    "nonfoa": "Non-FoA, sub1",
+    "constant50_sub1": "Constant 50x50, sub1",
+    "constant50_sub2": "Constant 50x50, sub2",
+    "constant70": "Constant 70x70, sub2",
+    "decreasing": "Decreasing 30-50-70",
+    "constant70_p": "Constant(P) 70x70, sub2",
+    "decreasing_p": "Decreasing(P) 30-50-70",
+}
+_NOT_COMPARED = FREE | {"seed", "game", "name"}
+Groups = dict[str, list[RunData]]  # seeds of the same experiment, by the experiment's name
+
+
+def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
+    """The runs by game and experiment; of a preset in the paper's order and by the paper's names.
+
+    Raises:
+      ConfigError: no run is left; runs that are not of the same kind share a name.
+    """
+    games: dict[str, Groups] = {}
+    for run in runs:
+        base = run.config.name.removesuffix("_packed")
+        if preset is None or base in PRESETS[preset]:
+            games.setdefault(run.config.game, {}).setdefault(_label(run.config.name, preset), []).append(run)
+    if not games:
+        raise refuse("preset", preset, f"runs of {', '.join(PRESETS[str(preset)])}")
+    for groups in games.values():
+        for name, seeds in groups.items():
+            if differences := differing_keys(seeds):
+                key, values = next(iter(differences.items()))
+                other = next(run for run, value in zip(seeds, values, strict=True) if value != values[0])
+                accepted = "a set of runs that differ in their seeds alone, or in their names"
+                why = f"{name} differs in {key} from that of {seeds[0].path}"
+                raise refuse(str(other.path), accepted=accepted, why=why)
+    if preset is None:
+        return games
+    order = [_label(name + suffix, preset) for name in PRESETS[preset] for suffix in ("", "_packed")]
+    return {game: {name: groups[name] for name in order if name in groups} for game, groups in games.items()}
+
+
+def _label(name: str, preset: str | None) -> str:
+    base = name.removesuffix("_packed")
+    return _PAPER_NAMES[base] + (", packed" if base != name else "") if preset else name
+
+
+def differing_keys(runs: Sequence[RunData]) -> dict[str, list[Any]]:
+    """The keys that matter to what is learned and do not have the same value in all runs."""
+    flat = [dict(flatten(to_mapping(run.config))) for run in runs]
+    keys = dict.fromkeys(key for each in flat for key in each)
+    values = {key: [each.get(key) for each in flat] for key in keys if key not in _NOT_COMPARED}
+    return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
+
+
+def final_scores(groups: Groups) -> dict[str, Interval]:
+    """The interquartile mean of each experiment's runs on one game."""
+    return {name: interval([_finals(runs)], iqm) for name, runs in groups.items()}
+
+
+def all_games(games: Mapping[str, Groups]) -> dict[str, Interval]:
+    """The same over all games, where their scores can be compared, for the experiments that have played all of them."""
+    result = {}
+    for name in experiments_of(games):
+        strata = [normalised(game, _finals(groups[name])) for game, groups in games.items() if name in groups]
+        known = [scores for scores in strata if scores is not None]
+        if len(known) == len(games) > 1:
+            result[name] = interval(known, iqm)
+    return result
+
+
+def runs_of(games: Mapping[str, Groups]) -> list[RunData]:
+    """All of them."""
+    return [run for groups in games.values() for seeds in groups.values() for run in seeds]
+
+
+def experiments_of(games: Mapping[str, Groups]) -> list[str]:
+    """The names, each once, as they come."""
+    return list(dict.fromkeys(name for groups in games.values() for name in groups))
+
+
+def _finals(runs: Sequence[RunData]) -> np.ndarray:
+    return np.array([run.final_score for run in runs])

@@ -1,0 +1,94 @@
+"""Runs that are kept in `results/runs/`: what others need to judge and repeat them, and the tables of them."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from foajax.config import shipped
+from foajax.config.parse import refuse, replace, to_mapping
+from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
+from foajax.reporting.groups import games_of
+from foajax.runs.status import newest_checkpoint
+from foajax.sensors.registry import make_sensor
+
+KEPT = shipped.kept_runs()
+_ROWS = 500
+_MACHINE = ("cpu", "cores", "devices", "system", "python", "packages")
+
+
+def keep(path: Path, name: str | None) -> Path:
+    """Copies what matters of a run."""
+    run = read_run(path)
+    newest = newest_checkpoint(path) or int(run.env_steps[-1])  # rows of a run that was killed may go on beyond it
+    wanted = {"env_steps": newest, "policy": "sampled", "episodes": 100}
+    found = {key: (run.evaluation or {}).get(key) for key in wanted}
+    if found != wanted:
+        command = f"evaluate run={path} json={path}/score.json"
+        raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
+    config = replace(run.config, run=None)
+    game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
+    out = KEPT / game / (name or f"{config.name}-s{config.seed}")
+    text = yaml.safe_dump(to_mapping(config), sort_keys=False)
+    if out.exists() and (out / "config.yaml").read_text() != text:
+        raise refuse("name", out.name, "another name=<name>-s<seed>", why="holds another run")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "config.yaml").write_text(text)
+    rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
+    rows = [row for row in rows if json.loads(row)["env_steps"] <= newest]
+    chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
+    (out / "metrics.jsonl").write_text("".join(rows[i] for i in chosen))
+    (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")
+    (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
+    return out
+
+
+def _facts(run: RunData, newest: int) -> dict[str, Any]:
+    starts = json.loads((run.path / "run.json").read_text())["starts"]
+    # What a later start changes, such as train.env_steps, is part of what has to be repeated.
+    words = [word for word in starts[-1]["command"] if "=" in word and not word.startswith("run=")]
+    return {
+        "command": f"python -m foajax.train {shlex.join(words)}",
+        "starts": [{"time": start["time"], "commit": start["commit"]} for start in starts],
+        "seed": run.config.seed,
+        "env_steps": newest,
+        "hours": round(float(run.time[run.env_steps <= newest][-1]) / 3600, 2),
+        **{key: starts[-1][key] for key in _MACHINE if key in starts[-1]},  # older runs do not name their devices
+    }
+
+
+def row(run: RunData) -> list[str]:
+    """A line of the table."""
+    facts, score = json.loads((run.path / "run.json").read_text()), run.evaluation or {}
+    values = make_sensor(run.config.sensor).count(run.config.env.frame_shape).nominal
+    return [
+        run.config.game,
+        f"`{run.config.name}`",
+        str(run.config.seed),
+        str(values),
+        run.config.gaze.mode,
+        f"{facts['env_steps'] / 1e6:.1f} M",
+        f"{facts['hours']:.1f}",
+        f"{score['mean']:.1f} ± {score['stderr']:.1f}",
+        f"[{run.path.parent.name}/{run.path.name}]({run.path.parent.name}/{run.path.name})",
+    ]
+
+
+def write_tables(directory: Path = KEPT) -> None:
+    """Makes the table and the learning curves of all kept runs anew."""
+    runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
+    head = ["game", "experiment", "seed", "values", "gaze", "env_steps", "hours", "score", "kept in"]
+    lines = [head, ["---"] * len(head), *map(row, runs)]
+    intro = (
+        "Score: mean and standard error over 100 whole games, unclipped, sampled policy, of the last checkpoint. Each\n"
+        "`run.json` has the command, the commit and the machine. Made by `python -m foajax.keep`."
+    )
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n")
+    for game, groups in games_of(runs, None).items():
+        draw_curves(groups, game, colours_of(groups)).savefig(directory / f"{game}.png", dpi=110)

@@ -1,0 +1,108 @@
+"""`python -m foajax.reproduce stage=1 jobs=2`: the paper's comparison, run by run, each evaluated in 100 games.
+
+`experiments/reproduce.yaml` has the stages. A run that is finished is skipped and one that was stopped goes on, so the
+same command is given again and again until nothing is left. `show=table` says how far each run is; `show=commands`
+prints a command for each run that is left, as for the tasks of a cluster's job array. `python -m foajax.keep
+run=<dir>` keeps a run in results/.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import Field
+from rich.console import Console
+from rich.table import Table
+
+from foajax import cli
+from foajax.config import shipped
+from foajax.config.parse import Section, refuse
+from foajax.launch import sweep
+from foajax.runs.directory import is_run
+from foajax.runs.status import inspect, is_finished
+
+_EPISODES = 100  # whole games that a final policy is scored in
+
+
+class Options(Section):
+    """What the command takes."""
+
+    stage: int | None = Field(None, description="Which stage to run; null for all, one after another.")
+    jobs: int = Field(1, ge=1, description="Runs at a time, each with its share of the cores.")
+    show: Literal["table", "commands"] | None = Field(
+        None, description="Print how far each run is, or a command for each that is left, and run nothing."
+    )
+
+    def check(self) -> None:
+        most = len(stages())
+        if self.stage is not None and not 1 <= self.stage <= most:
+            raise refuse("stage", self.stage, f"null or an integer from 1 to {most}")
+
+
+def stages() -> list[dict]:
+    """The stages of `experiments/reproduce.yaml`: what each is `about`, and the words of its sweeps."""
+    return yaml.safe_load((shipped.experiments() / "reproduce.yaml").read_text())["stages"]
+
+
+def reproduce(arguments: Sequence[str]) -> int:
+    """The command; 1 where a run failed."""
+    options = cli.parse(Options, arguments)
+    chosen = [stage for i, stage in enumerate(stages(), 1) if options.stage in (None, i)]
+    planned = [
+        (stage["about"], [run for line in stage["runs"] for run in sweep.expand(line.split())]) for stage in chosen
+    ]
+    if options.show == "table":
+        return _show(planned)
+    failed = 0
+    for about, runs in planned:
+        if options.show == "commands":
+            print(
+                *(f"python -m foajax.train {' '.join(run.words)}" for run in runs if not is_finished(run.config)),
+                sep="\n",
+            )
+            continue
+        print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
+        failed |= sweep.run_all(runs, jobs=options.jobs) | _evaluate(runs, options.jobs)
+    return failed
+
+
+def _evaluate(runs: Sequence[sweep.Run], jobs: int) -> int:
+    """Plays the games of finished runs that have not been scored; 1 where that failed."""
+    left = [run.config for run in runs if is_finished(run.config) and not _score(run).exists()]
+    words = [[f"run={config.run_dir}", f"episodes={_EPISODES}", f"json={config.run_dir}/score.json"] for config in left]
+    with ThreadPoolExecutor(jobs) as pool:
+        commands = [[sys.executable, "-m", "foajax.evaluate", *each] for each in words]
+        return max([int(code != 0) for code in pool.map(subprocess.call, commands)], default=0)
+
+
+def _score(run: sweep.Run) -> Path:
+    return Path(run.config.run_dir) / "score.json"
+
+
+def _show(planned: Sequence[tuple[str, Sequence[sweep.Run]]]) -> int:
+    table = Table("stage", "run", "state", "env_steps", "score")
+    for about, runs in planned:
+        for run in runs:
+            path = Path(run.config.run_dir)
+            known = inspect(path) if is_run(path) else None
+            score = yaml.safe_load(_score(run).read_text()) if _score(run).exists() else None
+            table.add_row(
+                about if run is runs[0] else "",
+                run.config.run_dir,
+                known.state if known else "not begun",
+                f"{known.env_steps:,}" if known else "",
+                f"{score['mean']:.1f} ± {score['stderr']:.1f}" if score else "",
+            )
+        table.add_section()
+    Console(width=140).print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(reproduce))

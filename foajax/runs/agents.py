@@ -1,0 +1,228 @@
+"""Trained agents on disk: `agent.json` and `config.yaml` beside either checkpoints or one safetensors file.
+
+A run directory and a shipped agent are read alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import yaml
+from jaxtyping import Int
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from foajax.config.parse import ConfigError, flatten, refuse, replace, to_mapping
+from foajax.config.schema import Config
+from foajax.config.shipped import agents
+from foajax.learning.agent import Agent
+from foajax.learning.programs import make_state
+from foajax.runs import durable
+from foajax.runs.checkpoints import Checkpoints
+from foajax.runs.directory import PARAMETERS, is_run, load_config
+from foajax.types import FrameStatistics, Params, TimeStep, TrainState
+
+FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
+CHECKPOINTS = "checkpoints"
+
+
+class Actions(NamedTuple):
+    """What B agents do, and where they looked."""
+
+    natural: Int[np.ndarray, "B"]  # counted from 0, held for `env.frame_skip` frames
+    vision: Int[np.ndarray, "B"]  # 0 where gaze is not learned
+    focal_point: Int[np.ndarray, "B 2"]  # (y, x) of the frames given, in frame pixels
+
+
+@dataclasses.dataclass
+class TrainedAgent:
+    """An agent read from disk. `decide` goes from frame to frame and keeps memory, gaze and random numbers itself."""
+
+    agent: Agent
+    params: Params
+    statistics: FrameStatistics
+    env_steps: int  # it has been trained for
+
+    def reset(self, batch: int = 1, *, seed: int = 0, greedy: bool = False) -> None:
+        """Begins the episodes of `batch` actors; their policies are sampled, or with `greedy` their modes are taken."""
+        self._act = jax.jit(functools.partial(self.agent.act, greedy=greedy))
+        self._state, self._starts = self.agent.initial_state(batch), np.ones(batch, bool)
+        self._keys = iter(map(functools.partial(jax.random.fold_in, jax.random.key(seed)), itertools.count()))
+
+    def decide(
+        self, frames: np.ndarray, rewards: np.ndarray | None = None, *, starts: np.ndarray | None = None
+    ) -> Actions:
+        """Decides on the next frames; the first call after `reset`, or none, begins the episodes.
+
+        Args:
+          frames: uint8 [B, H, W], gray: an Atari screen [B, 210, 160], else of `env.frame_shape`.
+          rewards: float [B], what the last actions earned, as in training (clipped); None for 0.
+          starts: bool [B], whose episodes begin with this frame; None for nobody's.
+
+        Raises:
+          ValueError: frames of another type, shape or number.
+        """
+        if not hasattr(self, "_state"):
+            self.reset(len(frames))
+        batch = len(self._starts)
+        if len(frames) != batch:
+            raise ValueError(f"frames={list(frames.shape)}: accepted is [{batch}, ...], as reset({batch}) was told")
+        timestep = TimeStep(
+            frame=np.asarray(frames),
+            reward=np.zeros(batch, np.float32) if rewards is None else np.asarray(rewards, np.float32),
+            is_first=self._starts if starts is None else self._starts | np.asarray(starts, bool),
+            is_terminal=np.zeros(batch, bool),
+        )
+        output, _, self._state = self._act(self.params, self.statistics, self._state, timestep, next(self._keys))
+        self._starts = np.zeros(batch, bool)
+        return Actions(*map(np.asarray, (output.natural_action, output.vision_action, output.focal_point)))
+
+
+def save_facts(agent: Agent, directory: Path, **more: Any) -> None:
+    """Writes what `load_agent` needs beside `config.yaml`, and more facts if there are."""
+    facts = {"num_actions": agent.num_actions, "crop_top": agent.crop_top}
+    durable.replace(directory / FACTS, (json.dumps(facts | more) + "\n").encode())
+
+
+def load_score(path: str | Path) -> dict[str, Any] | None:
+    """What `evaluate` found of a shipped agent: mean, stderr, episodes, policy; None where nobody has said."""
+    try:
+        return json.loads((find(path) / FACTS).read_text()).get("score")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def find(path: str | Path) -> Path:
+    """The directory that `run=` names: a path, else a shipped agent's name."""
+    path, shipped = Path(path), agents() / path
+    return shipped if not (path / "config.yaml").exists() and (shipped / "config.yaml").exists() else path
+
+
+def check_trust(path: Path, config: Config, trust: bool) -> None:
+    """`ConfigError` where a configuration from disk names code, which would run, and the user has not said so."""
+    if config.code and not trust:
+        accepted = "trust=true where you trust whoever made it"
+        raise ConfigError(f"run={path}: it would run code, {', '.join(config.code)}; accepted is {accepted}")
+
+
+def load_agent(path: str | Path, *, best: bool = False, trust: bool = False) -> TrainedAgent:
+    """Reads a trained agent.
+
+    Args:
+      path: a run's or an agent's directory, or the name of a shipped agent, e.g. `pong-constant70_packed`.
+      best: of a run, whether its best checkpoint by its score in training is read, and not the newest good one.
+      trust: whether code that its configuration names (`package.module:Name`) may be imported and run.
+
+    Raises:
+      ConfigError: there is none, it cannot be read, or it would run code and `trust` is not given.
+    """
+    path = find(path)
+    config = load_config(path)
+    check_trust(path, config, trust)
+    try:
+        facts = json.loads((path / FACTS).read_text())
+        num_actions, crop_top = facts["num_actions"], facts["crop_top"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise refuse("run", path, "a run or an agent", why=f"{FACTS} is missing or not readable") from None
+    if not isinstance(num_actions, int) or num_actions < 1:
+        raise refuse("run", path, "an integer >= 1", why=f"{FACTS} has num_actions={num_actions}")
+    agent = Agent(config, num_actions, crop_top)
+    if (path / PARAMETERS).exists():
+        return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
+    template = jax.eval_shape(lambda: make_state(agent, 0))
+    checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
+    restored = checkpoints.restore_part({"train": template}, best=best)
+    if restored is None:
+        raise ConfigError(f"run={path}: has no checkpoint yet")
+    env_steps, state, _ = restored
+    return TrainedAgent(agent, state["train"].params, state["train"].statistics, env_steps)
+
+
+def check_source(path: str) -> None:
+    """`ConfigError`, about `train.init_from`, where `path` is neither a run nor an agent."""
+    try:
+        load_config(find(path))
+    except ConfigError as error:
+        raise ConfigError(f"train.init_from={path}: {error}") from None
+
+
+def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
+    """The state at the start of a run, with a stored agent's parameters and frame statistics.
+
+    Raises:
+      ConfigError: there is no such agent, or it has another network or other images.
+    """
+    key = f"train.init_from={path}"
+    try:
+        there = load_config(find(path)).code
+        stored = load_agent(path, trust=set(there) <= set(config.code))  # what this run's own words name is trusted
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+    arrays_there, wanted = (named((s.params, s.statistics)) for s in (stored, state))
+    for name in [*wanted, *arrays_there]:
+        have, want = (arrays[name].shape if name in arrays else None for arrays in (arrays_there, wanted))
+        if have != want:
+            accepted = (
+                f"an agent with this run's sensor, network, gaze and number of actions; {_differences(stored, config)}"
+            )
+            raise refuse(key, accepted=accepted, why=f"{name} has the shape {have}, here it is {want}")
+    params, statistics = jax.tree.map(jnp.asarray, (stored.params, stored.statistics))
+    return state._replace(params=params, statistics=statistics)
+
+
+def _differences(stored: TrainedAgent, config: Config) -> str:
+    """What of another configuration may be why an agent's parameters do not fit it."""
+    there, here = (dict(flatten(to_mapping(c))) for c in (stored.agent.config, config))
+    groups = ("sensor", "network", "gaze")
+    differ = [key for key in there if key.startswith(groups) and here.get(key) != there[key]]
+    return "that one has " + (", ".join(f"{key}={there[key]}" for key in differ) or "other actions")
+
+
+def save_agent(stored: TrainedAgent, directory: Path, score: Mapping[str, Any] | None = None) -> None:
+    """Writes a shipped agent: float32 arrays by name, the configuration and the facts, its score among them.
+
+    Raises:
+      ConfigError: `directory` is a run's, or cannot be written.
+    """
+    if is_run(directory):
+        raise refuse("out", directory, "another directory", why="is a run")
+    config = to_mapping(replace(stored.agent.config, run=None))  # where it was trained does not matter
+    known = {} if score is None else {"score": dict(score)}
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        save_file(named((stored.params, stored.statistics)), directory / PARAMETERS)
+        (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+        save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
+    except (OSError, SafetensorError) as error:
+        raise refuse("out", directory, f"a directory that can be written ({error})") from None
+
+
+def _load_shipped(agent: Agent, file: Path, env_steps: int) -> TrainedAgent:
+    template = jax.eval_shape(lambda: make_state(agent, 0))
+    wanted = (template.params, template.statistics)
+    try:
+        arrays = load_file(file)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"run={file.parent}: {file.name} is not readable: {str(error).splitlines()[0]}") from None
+    names = named(wanted)
+    if {n: a.shape for n, a in arrays.items()} != {n: s.shape for n, s in names.items()}:
+        raise ConfigError(f"run={file.parent}: {file.name} does not hold the parameters that config.yaml describes")
+    leaves = [jnp.asarray(arrays[name]) for name in names]  # once: NumPy's would be handed over at each decision
+    params, statistics = jax.tree.unflatten(jax.tree.structure(wanted), leaves)
+    return TrainedAgent(agent, params, statistics, env_steps)
+
+
+def named(tree) -> dict:
+    """Leaves by their path, e.g. `0/params/dense/kernel`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named.items()}

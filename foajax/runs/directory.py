@@ -1,0 +1,216 @@
+"""A run's directory: held by one process at a time, and for one meaning of the configuration.
+
+    config.yaml   the resolved configuration
+    run.json      every start: command, versions, commit, machine, devices, time
+    lock          locked by the process that trains; names it
+    failure.txt   why the last start failed, where it did
+
+Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (checkpoints).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from foajax.config.parse import ConfigError, flatten, one_line, refuse, replace, to_mapping
+from foajax.config.schema import Config, from_mapping
+from foajax.runs import durable
+from foajax.runs.lock import RunError, reason_of, take_lock
+from foajax.runs.provenance import RECORD, record_start
+
+PARAMETERS = "agent.safetensors"  # of a shipped agent, which is no run
+_CONFIG = "config.yaml"
+_FAILURE = "failure.txt"
+# Keys that runs have not always had, and what was done before: older runs are read as they were made.
+_BEFORE = {
+    "network": {
+        **{"lstm_norm": False, "padding": "valid", "focal_point": "packed", "focal_scale": "frame"},
+        **{"dense_norm": False, "last_actions": False, "last_reward": False, "forget_bias": 0.0},
+    },
+    "learner": {
+        **{"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step", "credits_last_gaze": True},
+    },
+}
+# What may change between two starts of a run: none of it changes what a step learns.
+FREE = {
+    *("run", "profile", "env.threads", "env.timeout"),
+    *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep_checkpoints"),
+    *("train.max_skipped", "train.dump_skipped"),
+    *("train.devices", *(f"distributed.{key}" for key in ("coordinator", "processes", "process", "timeout"))),
+}
+
+
+class RunDir:
+    """A run's directory, held by this process until `close` or the end of a `with`."""
+
+    def __init__(self, path: Path, lock: int) -> None:
+        self.path = path
+        self._lock = lock
+
+    def close(self) -> None:
+        """Lets another process have the directory."""
+        if self._lock >= 0:
+            os.close(self._lock)
+        self._lock = -1
+
+    def __enter__(self) -> RunDir:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception):
+            note_failure(self.path, describe_error(error))
+        self.close()
+
+
+def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] = ()) -> RunDir:
+    """Creates or reopens ``config.run_dir`` and holds it.
+
+    The lock is the kernel's: it ends with the process, however that ends. ``config.yaml`` is written, or
+    compared with what is there: a key that changes what is learned has to have its old value, the others
+    (lengths, intervals, threads) are taken over. ``run.json`` gains an entry.
+
+    Args:
+      config: the run that is asked for.
+      command: the words that started this process, for the record.
+      devices: the kinds of the run's devices, for the record.
+
+    Raises:
+      RunError: the directory cannot be created, written or read, is in use, or holds another run or a shipped agent.
+    """
+    path = Path(config.run_dir)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise refuse("run", path, "a directory", why="is a file", kind=RunError) from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"run={path}: cannot be created ({reason_of(error)}); choose another run=<dir>") from None
+    if os.path.lexists(path / PARAMETERS):
+        accepted = f"another run=<dir>, with train.init_from={path} to begin from its parameters"
+        raise refuse("run", path, accepted, why="is a shipped agent", kind=RunError)
+    run_dir = RunDir(path, take_lock(path))
+    try:
+        _settle_config(path, config)
+        record_start(path, command, devices)
+        (path / _FAILURE).unlink(missing_ok=True)
+    except OSError as error:
+        run_dir.close()
+        raise RunError(f"run={path}: cannot be used ({reason_of(error)}); choose another run=<dir>") from None
+    except BaseException:
+        run_dir.close()
+        raise
+    return run_dir
+
+
+def take_over(path: Path) -> RunDir | None:
+    """Holds the directory of a run that nobody holds any more; None where somebody does or it cannot be seen."""
+    try:
+        return RunDir(path, take_lock(path)) if is_run(path) else None
+    except RunError:
+        return None
+
+
+def load_config(path: str | os.PathLike[str]) -> Config:
+    """The configuration of the run in `path`, with ``run`` set to `path`.
+
+    Raises:
+      RunError: there is no such directory, it is no run, or its ``config.yaml`` cannot be read.
+    """
+    path = Path(path)
+    file = path / _CONFIG
+    try:
+        mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if not isinstance(mapping, dict):
+            raise ConfigError("is not the configuration of a run (no mapping)")
+        for group, before in _BEFORE.items():
+            if isinstance(mapping.get(group), dict):
+                mapping[group] = before | mapping[group]
+        config = from_mapping(mapping)
+    except (FileNotFoundError, NotADirectoryError):
+        there = f"has no {_CONFIG}" if os.path.isdir(path) else "is a file"
+        what = there if os.path.exists(path) else "does not exist"
+        raise refuse("run", path, "the directory of a run", why=what, kind=RunError) from None
+    except ConfigError as error:
+        raise RunError(f"{file}: {error}") from None
+    except OSError as error:
+        raise RunError(f"{file}: cannot be read ({reason_of(error)})") from None
+    except Exception as error:  # a file of any content ends up here
+        raise RunError(f"{file}: is not the configuration of a run ({reason_of(error)})") from None
+    return replace(config, run=str(path))
+
+
+def is_run(path: Path) -> bool:
+    """Whether `path` is the directory of a run that has been started."""
+    return (path / _CONFIG).is_file() and (path / RECORD).is_file()
+
+
+def note_failure(path: Path, why: str) -> None:
+    """Keeps why this start of the run in `path` failed."""
+    with contextlib.suppress(OSError):
+        (path / _FAILURE).write_text(why + "\n", encoding="utf-8")
+
+
+def forget_failure(path: Path) -> None:
+    """The run in `path` is started again: what it failed of before is past."""
+    with contextlib.suppress(OSError):
+        (path / _FAILURE).unlink(missing_ok=True)
+
+
+def failure(path: Path) -> str | None:
+    """Why the last start of the run in `path` failed, in one line; None where it did not."""
+    try:
+        return (path / _FAILURE).read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return None
+
+
+def describe_error(error: Exception) -> str:
+    """An error in one line: the text of what the user can mend, else its type as well."""
+    text = one_line(error)
+    return text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}"
+
+
+def _settle_config(path: Path, config: Config) -> None:
+    """Writes ``config.yaml`` if it is new or differs in ways that may; RunError if in others."""
+    text = yaml.safe_dump(to_mapping(config), sort_keys=False)
+    file = path / _CONFIG
+    if os.path.lexists(file):
+        check_same_run(path, config)
+        if file.read_text(encoding="utf-8") == text:
+            return
+    durable.replace(file, text.encode())
+
+
+def check_same_run(path: Path, config: Config) -> None:
+    """RunError where the run in `path` differs from `config` in a key that changes what is learned.
+
+    Where nothing was learned yet, because the run was refused, it may differ: the next words correct the last ones.
+    """
+    stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
+    if not _has_begun(path):
+        return
+    # With a falling learning rate the length of the run is part of what a step learns.
+    free = FREE - {"train.env_steps"} if config.learner.schedule == "linear" else FREE
+    keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
+    if keys:
+        old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
+        remedy = "choose another run=<dir> or restore the value"
+        if keys[0] == "train.env_steps":
+            remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
+        raise RunError(f"{keys[0]}={new}: the run in {path} has {old}; {remedy}")
+
+
+def _has_begun(path: Path) -> bool:
+    """Whether a row or a checkpoint is there."""
+    rows, checkpoints = path / "metrics.jsonl", path / "checkpoints"
+    return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
+
+
+def _show(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)

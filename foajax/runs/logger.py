@@ -1,0 +1,169 @@
+"""What a run says while it trains: ``metrics.jsonl``, TensorBoard, the terminal.
+
+``metrics.jsonl`` in the run directory is the source of truth, one JSON object a row:
+
+    {"env_steps": 64000, "time": 51.2, "score": 1.5, ...}
+
+``time`` is seconds of training over all starts of the run, without the work that a resumed run repeats.
+What is not finite becomes null, so that every row is valid JSON. No output that fails ends a run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from numbers import Integral
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import numpy as np
+from jaxtyping import UInt8
+
+from foajax.config.parse import one_line
+from foajax.runs import durable
+from foajax.runs.display import Display
+from foajax.runs.durable import WholeFile
+from foajax.runs.rows import parse_row
+from foajax.runs.tensorboard import EventFile
+
+_WARN_EVERY = 60.0  # seconds between two warnings about the same output
+
+
+class Logger:
+    """All outputs of one start of a run.
+
+    Args:
+      run_dir: where ``metrics.jsonl`` and ``tensorboard/`` are.
+      total_env_steps: where the run ends.
+      start_env_steps: where this start takes it up. Rows beyond it belong to work that will be done again
+        and are removed, as are torn ones.
+      frame_skip: emulator frames an agent step, for the terminal.
+      live: whether to draw in place; None does so where stdout is a terminal.
+
+    Raises:
+      OSError: ``metrics.jsonl`` cannot be read or written now. Later such errors are only reported.
+    """
+
+    def __init__(
+        self,
+        run_dir: str | os.PathLike[str],
+        *,
+        total_env_steps: int,
+        start_env_steps: int,
+        frame_skip: int = 4,
+        live: bool | None = None,
+    ) -> None:
+        directory = Path(run_dir)
+        self._metrics = _MetricsFile(directory / "metrics.jsonl", start_env_steps)
+        self._events = EventFile(directory / "tensorboard", start_env_steps)
+        self._env_steps = start_env_steps
+        self._seconds = self._metrics.seconds - time.monotonic()
+        self._warned: dict[str, float] = {}
+        self._display = Display(
+            total_env_steps=total_env_steps,
+            start=(start_env_steps, self._metrics.seconds),
+            frame_skip=frame_skip,
+            live=live,
+        )
+
+    def write(self, row: Mapping[str, SupportsFloat]) -> None:
+        """One row of scalars; ``env_steps`` is required, ``time`` is added unless it is there."""
+        env_steps, seconds = int(float(row["env_steps"])), round(time.monotonic() + self._seconds, 3)
+        scalars = {name: _plain(value) for name, value in row.items()}
+        record = {"env_steps": env_steps, "time": seconds} | scalars | {"env_steps": env_steps}
+        self._env_steps = env_steps
+        with self._survive("metrics.jsonl"):
+            self._metrics.append(record)
+        with self._survive("tensorboard"):
+            self._events.scalars(record)
+        self._display.show(record)
+
+    def image(self, tag: str, array: UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]) -> None:
+        """An image, gray or colour, 0..255, for TensorBoard; belongs to the last row's ``env_steps``."""
+        with self._survive("tensorboard"):
+            self._events.image(tag, array, self._env_steps)
+
+    def message(self, text: str) -> None:
+        """A line for the reader of the terminal; may come from any thread."""
+        self._display.message(text)
+
+    def close(self) -> None:
+        """Ends the display and the files."""
+        for output, close in (("metrics.jsonl", self._metrics.close), ("tensorboard", self._events.close)):
+            with self._survive(output):
+                close()
+        self._display.close()
+
+    def __enter__(self) -> Logger:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextlib.contextmanager
+    def _survive(self, output: str) -> Iterator[None]:
+        """Turns an error into a message, at most one a minute for each output."""
+        try:
+            yield
+        except Exception as error:
+            now = time.monotonic()
+            if now - self._warned.get(output, -math.inf) >= _WARN_EVERY:
+                self._warned[output] = now
+                reason = one_line(error) or type(error).__name__
+                self.message(f"warning: {output} cannot be written ({reason}); training goes on")
+
+
+def _plain(value: SupportsFloat) -> int | float | None:
+    """A number that JSON has."""
+    if isinstance(value, Integral):
+        return int(value)
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+class _MetricsFile:
+    """Rows that could not be written are kept and come first the next time."""
+
+    def __init__(self, path: Path, start_env_steps: int) -> None:
+        self.seconds = _trim(path, start_env_steps)  # of training up to the last row
+        self._pending = b""
+        self._file = WholeFile(path)
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        self._pending += json.dumps(record, allow_nan=False).encode() + b"\n"
+        self._flush()
+
+    def close(self) -> None:
+        try:
+            self._flush()
+        finally:
+            self._file.close()
+
+    def _flush(self) -> None:
+        self._file.append(self._pending)
+        self._pending = b""
+
+
+def _trim(path: Path, start_env_steps: int) -> float:
+    """Removes rows beyond `start_env_steps` and what is no row; the last row's ``time`` is returned.
+
+    Where nothing stays (a run whose checkpoints are gone starts anew), the rows are kept as ``metrics.old.jsonl``.
+    """
+    content = path.read_bytes() if path.exists() else b""
+    kept, seconds = [], 0.0
+    for line in content.splitlines(keepends=True):
+        row = parse_row(line) if line.endswith(b"\n") else None
+        if row is not None and row["env_steps"] <= start_env_steps:
+            kept.append(line)
+            seconds = float(row["time"])
+    if content and not kept:
+        old = path.with_name("metrics.old.jsonl")
+        durable.replace(old, (old.read_bytes() if old.exists() else b"") + content)
+        path.unlink()
+    elif b"".join(kept) != content:
+        durable.replace(path, b"".join(kept))
+    return seconds

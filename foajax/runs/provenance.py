@@ -1,0 +1,98 @@
+"""``run.json``: what every start of a run was made with."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import socket
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from foajax.runs import durable
+from foajax.runs.lock import RunError
+
+RECORD = "run.json"
+_PACKAGES = (
+    "foajax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "numpy",
+    "envpool",
+    "ale-py",
+    "gymnasium",
+)
+
+
+def record_start(path: Path, command: Sequence[str], devices: Sequence[str]) -> None:
+    """Adds an entry for this start of the run in `path`."""
+    file = path / RECORD
+    try:
+        record = json.loads(file.read_text(encoding="utf-8")) if os.path.lexists(file) else {"starts": []}
+        record["starts"].append(_describe_start(command, devices))
+    except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
+        raise RunError(f"{file}: is not the record of a run; move it away") from None
+    durable.replace(file, (json.dumps(record, indent=1) + "\n").encode())
+
+
+def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str, Any]:
+    return {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": list(command),
+        "directory": os.getcwd(),
+        "commit": commit(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        "system": platform.platform(),
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "devices": list(devices),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """The commit of the checkout this package runs from, with "-dirty" after changes; None elsewhere."""
+    package = Path(__file__).resolve().parents[1]
+    # An installed package may lie inside the checkout of something else.
+    if not (package.parent / ".git").exists():
+        return None
+    words = ["git", "-C", str(package), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        result = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip() or None
+
+
+def last_commit(path: Path) -> str | None:
+    """The commit that the run in `path` was last started with; None of anything else."""
+    try:
+        return json.loads((path / RECORD).read_text(encoding="utf-8"))["starts"][-1]["commit"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+def _cpu() -> str:
+    """The processor's model where the system says it, else its architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()

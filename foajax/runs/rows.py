@@ -1,0 +1,40 @@
+"""Rows of ``metrics.jsonl``, as others read them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+_TAIL = 2**16  # bytes of metrics.jsonl read: some hundred rows
+_SPEED_ROWS = 10  # rows that the shown speed is averaged over
+
+
+def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
+    """A row of ``metrics.jsonl`` with finite ``env_steps``, ``time`` and `more`; None where it is torn or none."""
+    try:
+        row = json.loads(line)
+        return row if all(math.isfinite(row[key]) for key in ("env_steps", "time", *more)) else None
+    except (ValueError, RecursionError, LookupError, TypeError, OverflowError):
+        return None
+
+
+def last_rows(path: Path) -> list[dict[str, Any]]:
+    """The newest rows of metrics, oldest first; a torn one is left out."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+            lines = file.read().splitlines()
+    except OSError:
+        return []
+    return [row for line in lines if (row := parse_row(line))]
+
+
+def speed_of(rows: list[dict[str, Any]]) -> float | None:
+    """Env_steps a second over the newest rows; None where they do not tell."""
+    first, last = (rows[-_SPEED_ROWS - 1 :][0], rows[-1]) if len(rows) > 1 else (None, None)
+    if first is None or last is None or last["time"] <= first["time"]:
+        return None
+    return (last["env_steps"] - first["env_steps"]) / (last["time"] - first["time"])

@@ -1,0 +1,156 @@
+"""A log-polar retina: cells in rings around the focal point, growing with the distance from it.
+
+Geometry, ours. The focal point (y, x) means the corner between pixels (y - 1, x - 1) and (y, x), as
+for every area of even size, so that a disc of radius 40 fits an 80 x 80 frame exactly. The outer
+edges of the rings grow geometrically from `fovea` to `radius`; the innermost ring is the whole disc
+of radius `fovea`, so there is no blind spot. Wedge j spans the angles 2 pi [j, j + 1) / wedges, from
+the x axis towards the y axis: clockwise on the screen, as in OpenCV's `warpPolar`.
+
+Where pixels come from is worked out once per sensor, in NumPy; sensing is a gather and a weighted
+sum, at the same cost wherever the focal point is. Windows are squares of side 2 * ceil(radius).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Num
+
+from foajax.config.schema import LogPolarSensor
+from foajax.sensors.base import Sensor
+from foajax.sensors.window import Shape, look, place
+
+_SAMPLES = 32  # sample points along each side of a cell, to measure how much of it lies in a pixel
+
+
+class LogPolar(Sensor):
+    """The retina as a sensor: one image [rings, wedges]."""
+
+    is_round = True
+
+    def __init__(self, config: LogPolarSensor) -> None:
+        self.config, self.window = config, config.window
+
+    def sense(self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str) -> tuple[Array, ...]:
+        """The cells around the focal point."""
+        return look(frame, focal_point, bounds, size=self.window, pool=self._pool)
+
+    def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
+        """Rings and wedges, whatever the frame."""
+        return ((self.config.rings, self.config.wedges),)
+
+    def picture(
+        self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
+    ) -> Float[Array, "H W"]:
+        """The image warped back."""
+        window = unwarp(images[0], sensor=self.config)
+        return place(window, focal_point - np.array(self.window) // 2, frame_shape)
+
+    def _pool(self, window: Num[Array, "h w"]) -> tuple[Float[Array, "_ _"], ...]:
+        return (warp(window.astype(jnp.float32), sensor=self.config),)
+
+
+def warp(window: Float[Array, "side side"], *, sensor: LogPolarSensor) -> Float[Array, "rings wedges"]:
+    """A window of the frame, seen by the retina; inner rings first, values not rescaled.
+
+    'bilinear' samples each cell's centre, between four pixels: sharp, but a cell larger than a few
+    pixels misses what lies between the centres. 'area' takes the mean over each cell's area, which
+    does not alias; cells smaller than a pixel show the pixels under them.
+    """
+    pixels = window.reshape(-1)
+    cells = [(pixels[index] * weight).sum(1) for index, weight in _tables(sensor)]
+    return jnp.concatenate(cells).reshape(sensor.rings, sensor.wedges)
+
+
+def unwarp(image: Float[Array, "rings wedges"], *, sensor: LogPolarSensor) -> Float[Array, "side side"]:
+    """The inverse, for pictures: each pixel shows the cell that its centre lies in, 0 outside the disc."""
+    cell, inside = _cell_of_pixel(sensor)
+    return jnp.where(inside, image.reshape(-1)[cell], 0.0)
+
+
+def ring_edges(sensor: LogPolarSensor) -> np.ndarray:
+    """Radii [rings + 1] at which the rings begin and end, frame pixels: 0, fovea, ..., radius."""
+    growth = sensor.radius / sensor.fovea
+    return np.concatenate([[0.0], sensor.fovea * growth ** (np.arange(sensor.rings) / (sensor.rings - 1))])
+
+
+def shares(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(cell, pixel of the window, weight) of all that `warp` adds up, sorted by cell; cells and pixels are numbered."""
+    return _bilinear_weights(sensor) if sensor.sampling == "bilinear" else _area_weights(sensor)
+
+
+@functools.lru_cache
+def _tables(sensor: LogPolarSensor) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Pixel indices and weights, each [cells, k], for one run of rings after the other.
+
+    Rows are padded to the same k with weight 0. Outer cells have more pixels: one k for all would
+    triple the work, so rings are grouped by k, within a factor of 1.4.
+    """
+    cell, pixel, weight = shares(sensor)
+    counts = np.bincount(cell, minlength=sensor.rings * sensor.wedges)
+    slot = np.arange(len(cell)) - np.repeat(np.cumsum(counts) - counts, counts)
+    index = np.zeros((len(counts), counts.max()), np.int32)
+    index[cell, slot] = pixel
+    weights = np.zeros(index.shape, np.float32)
+    weights[cell, slot] = weight
+    widths = counts.reshape(sensor.rings, sensor.wedges).max(1)
+    starts = [0, *np.flatnonzero(np.diff(np.ceil(2 * np.log2(widths)))) + 1, sensor.rings]
+    tables = []
+    for first, last in zip(starts, starts[1:], strict=False):
+        rows, k = slice(first * sensor.wedges, last * sensor.wedges), widths[first:last].max()
+        tables.append((index[rows, :k], weights[rows, :k]))
+    return tuple(tables)
+
+
+def _bilinear_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Four (cell, pixel, weight) for each cell, sorted by cell.
+
+    The centre of a cell halves its angle and, but for the innermost ring, its logarithmic radius.
+    """
+    edges = ring_edges(sensor)
+    radius = np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])[:, None]
+    angle = 2 * np.pi * (np.arange(sensor.wedges) + 0.5) / sensor.wedges
+    side = sensor.window[0]
+    y, x = (np.ravel(side / 2 - 0.5 + radius * turn(angle)) for turn in (np.sin, np.cos))
+    top, left = np.floor(y), np.floor(x)
+    pixels, weights = [], []
+    for row, row_weight in ((top, top + 1 - y), (top + 1, y - top)):
+        for column, column_weight in ((left, left + 1 - x), (left + 1, x - left)):
+            # The outermost centres may lie half a pixel beyond the last pixel's: it stands in.
+            pixels.append(np.clip(row, 0, side - 1) * side + np.clip(column, 0, side - 1))
+            weights.append(row_weight * column_weight)
+    cell = np.repeat(np.arange(len(y)), 4)
+    return cell, np.stack(pixels, 1).ravel(), np.stack(weights, 1).ravel()
+
+
+def _area_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(cell, pixel, share of the cell's area in that pixel), sorted by cell.
+
+    Measured with a grid of points in each cell, evenly spaced in area; ring by ring, to bound the memory.
+    """
+    fraction = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    wedge = np.arange(sensor.wedges)
+    angle = 2 * np.pi * (wedge[:, None] + fraction) / sensor.wedges
+    side, parts = sensor.window[0], []
+    for ring, (inner, outer) in enumerate(itertools.pairwise(ring_edges(sensor))):
+        radius = np.sqrt(inner**2 + (outer**2 - inner**2) * fraction)[:, None]
+        y, x = (np.floor(side / 2 + radius * turn(angle)[:, None, :]).astype(int) for turn in (np.sin, np.cos))
+        cell = (ring * sensor.wedges + wedge)[:, None, None]
+        parts.append(np.unique((cell * side + y) * side + x, return_counts=True))
+    hits, count = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return hits // side**2, hits % side**2, count / _SAMPLES**2
+
+
+@functools.lru_cache
+def _cell_of_pixel(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray]:
+    """For each pixel of the window [side, side], the cell that its centre lies in, and if it lies in any."""
+    offset = np.arange(sensor.window[0]) + 0.5 - sensor.window[0] / 2
+    radius = np.hypot(offset[:, None], offset)
+    ring = np.searchsorted(ring_edges(sensor)[1:], radius, side="right")
+    turn = np.arctan2(offset[:, None], offset) / (2 * math.pi) % 1.0
+    wedge = np.minimum((turn * sensor.wedges).astype(int), sensor.wedges - 1)
+    return np.minimum(ring, sensor.rings - 1) * sensor.wedges + wedge, ring < sensor.rings

@@ -1,0 +1,51 @@
+"""The picture of what a sensor sees, as one table of indices.
+
+Which value a pixel shows depends only on the pixel's place in the focal area or, outside of it, in the frame. So a
+recording needs to keep the values alone, and whoever draws them, in whatever language, needs two tables.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from foajax.sensors.base import Sensor
+
+
+class Painting(NamedTuple):
+    """Indices into the values of all images of a packed sensor, laid end to end; -1 where nothing is seen."""
+
+    window: Int[np.ndarray, "h w"]  # of the focal area's pixels
+    background: Int[np.ndarray, "H W"]  # of the frame's pixels, where the focal area is elsewhere
+
+
+def tables(sensor: Sensor, frame_shape: tuple[int, int]) -> Painting:
+    """The tables of a packed sensor: the picture of images whose values are their own numbers."""
+    images, count = [], 1  # 0 is what `picture` shows where nothing was seen
+    for shape in sensor.image_shapes(frame_shape):
+        size = int(np.prod(shape))
+        images.append(jnp.arange(count, count + size, dtype=jnp.float32).reshape(shape))
+        count += size
+    height, width = sensor.window
+    # A frame that the focal area fills, and one that it has just left.
+    inside = sensor.picture(tuple(images), jnp.array([height // 2, width // 2]), (height, width))
+    outside = jnp.array([height // 2 - height, width // 2 - width])
+    beside = sensor.picture(tuple(images), outside, frame_shape)
+    return Painting(*(np.asarray(p).round().astype(np.int32) - 1 for p in (inside, beside)))
+
+
+def paint(
+    values: UInt8[np.ndarray, "n"], focal_point: Int[np.ndarray, "2"], painting: Painting
+) -> UInt8[np.ndarray, "H W"]:
+    """The picture of one step's values; 0 where nothing is seen."""
+    values = np.append(values, np.uint8(0))  # what the index -1 finds
+    image = values[painting.background]
+    size = np.array(painting.window.shape)
+    first = np.asarray(focal_point) - size // 2
+    low, high = np.maximum(first, 0), np.minimum(first + size, image.shape)
+    seen = painting.window[low[0] - first[0] : high[0] - first[0], low[1] - first[1] : high[1] - first[1]]
+    image[low[0] : high[0], low[1] : high[1]] = values[seen]
+    return image

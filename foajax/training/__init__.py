@@ -1,0 +1,1 @@
+"""The loop of one training run, and what watches over it."""

@@ -1,0 +1,245 @@
+"""One training run: its parts wired together, and the loop."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foajax.config.parse import ConfigError, refuse
+from foajax.config.schema import Config
+from foajax.envs.atari import is_atari
+from foajax.envs.base import Environment
+from foajax.envs.make import make_environments
+from foajax.launch.processes import Job, Watch
+from foajax.launch.signals import StopRequest
+from foajax.learning.agent import Agent
+from foajax.learning.learner import Metrics
+from foajax.learning.programs import make_programs, make_state
+from foajax.learning.sharding import Layout
+from foajax.runs.agents import begin_from, save_facts
+from foajax.runs.directory import RunDir, note_failure
+from foajax.runs.logger import Logger
+from foajax.training.collector import ROLLOUTS_TO_OBSERVE, Collector, update_on
+from foajax.training.dump import Dump
+from foajax.training.episodes import EpisodeTracker
+from foajax.training.journal import Journal, check_finite
+from foajax.training.saving import Progress, Saving
+from foajax.training.watchdog import Watchdog, report_fault
+from foajax.types import Outcome, TrainState
+
+_PICTURES_EVERY = 900.0  # seconds
+
+
+class Run:
+    """One run's parts, at the point where its newest checkpoint left it.
+
+    Processes that share a run all act and learn; the first of them has the directory, and alone writes and speaks.
+    """
+
+    def __init__(self, config: Config, job: Job, run_dir: RunDir | None, resources: contextlib.ExitStack) -> None:
+        self._config, self._job, self._journal = config, job, Journal()
+        self._layout = Layout(job.devices, job.local_devices) if len(job.devices) > 1 else None
+        self._saving = Saving(config, job, self._layout, run_dir, self._journal.warn)
+        env_steps = int(job.tell("saved", str(self._saving.newest())))
+        self.progress = Progress(env_steps, EpisodeTracker(config.env.num_envs))
+        self._stop_agreed = False  # by several processes, which stop after the same rollout
+        environments = self._make_environments(resources)
+        self._agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
+        self._programs = make_programs(self._agent, self._layout)
+        self._collector = Collector(self._agent, self._programs, environments, seed=config.seed, part=job.index)
+        self.progress.state = self._first_state()
+        self._watch = Watch(job, config.distributed.timeout, self._saving.rescue)
+        with self._watch.expecting_others():
+            self._saving.restore(self.progress, self._collector)
+        is_new = not self.progress.env_steps and config.train.init_from is None
+        self._to_observe = ROLLOUTS_TO_OBSERVE if is_new else 0
+        self._dump = self._open(run_dir, resources)
+
+    def _make_environments(self, resources: contextlib.ExitStack) -> list[Environment]:
+        """This process's, watched. Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it
+        got."""
+        watchdog = Watchdog(
+            self._config.env.timeout,
+            abandon=self._abandon,
+            is_saved=lambda: self._saving.is_saved(self.progress),
+            alone=self._job.count == 1,
+        )
+        resources.enter_context(watchdog)
+        make = watchdog.watched("making the environments", make_environments, patience=10.0)  # emulators load slowly
+        environments = make(self._config, self.progress.env_steps, self._job.index, self._job.count)
+        for group, environment in enumerate(environments):
+            watchdog.watch(environment, f"environment group {group}")
+            resources.callback(environment.close)
+        return environments
+
+    def _first_state(self) -> TrainState:
+        """Before any learning, or with another agent's parameters; on all devices."""
+        config, job = self._config, self._job
+        state = make_state(self._agent, config.seed)
+        if (path := config.train.init_from) is not None and not self.progress.env_steps:
+            begun = job.by_first("parameters", lambda: begin_from(path, state, config))
+            state = job.share(state if begun is None else begun)
+        return self._layout.replicate(state) if self._layout else state
+
+    def _open(self, run_dir: RunDir | None, resources: contextlib.ExitStack) -> Dump | None:
+        """Opens the files that the run writes, and says how it starts; returns where to keep skipped batches."""
+        config, env_steps = self._config, self.progress.env_steps
+        if run_dir is None or self._saving.checkpoints is None:
+            self._journal.write_to(None)
+            return None
+        save_facts(self._agent, run_dir.path)
+        frame_skip = config.env.frame_skip if is_atari(config) else 1
+        logger = Logger(
+            run_dir.path, total_env_steps=config.train.env_steps, start_env_steps=env_steps, frame_skip=frame_skip
+        )
+        self._journal.write_to(resources.enter_context(logger))
+        resources.enter_context(self._saving.checkpoints)
+        self._journal.say(f"{run_dir.path}: {self._how_it_starts()}")
+        if not config.train.dump_skipped:
+            return None
+        return Dump(run_dir.path / "skipped", minibatches=config.learner.num_minibatches, warn=self._journal.warn)
+
+    def loop(self, stop: StopRequest) -> None:
+        """Rollouts and updates until `train.env_steps` or a request to stop; saves in the end, whatever ends it."""
+        try:
+            with self._watch.expecting_others():
+                self._loop(stop)
+        finally:
+            self._watch.rest()
+            self._saving.finish(self.progress)
+        if not self._saving.is_saved(self.progress):
+            raise ConfigError(self._unsaved())
+        asked = stop.name or ("a signal to another process" if self._stop_agreed else None)
+        self._journal.say(self._how_it_ends(asked))
+
+    def _loop(self, stop: StopRequest) -> None:
+        config, at = self._config, self.progress
+        logged = saved = time.monotonic()
+        pictured = -math.inf
+        metrics: list[Metrics] = []
+        while at.env_steps < config.train.env_steps and not self._is_to_stop(stop):
+            if self._job.count > 1:
+                self._stay_in_touch(compiled=bool(metrics))
+            own, outcomes = self._collector.collect(self._nearby(at.state), self._step())
+            outcomes, games = self._exchange(outcomes, stop)
+            self._track(outcomes)
+            # Fetched one rollout late: by now they are there, and nothing waits for the device.
+            self._check(metrics)
+            now = time.monotonic()
+            if metrics and now - logged >= config.train.log_every:
+                self._log(metrics)
+                logged = now
+            if self._dump:
+                self._dump.remember(at.env_steps, at.state.params, own)
+            rollouts = [self._layout.join(rollout) for rollout in own] if self._layout else own
+            if self._to_observe:
+                for rollout in rollouts:
+                    at.state = self._programs.observe(at.state, rollout)
+                self._to_observe -= 1
+                continue
+            at.state, metrics = update_on(rollouts, at.state, self._programs, config.learner)
+            at.env_steps += config.env.num_envs * config.learner.rollout_length
+            at.games = games
+            if now - pictured >= _PICTURES_EVERY:
+                self._journal.picture(own[0], config.env.frame_shape)
+                pictured = now
+            if now - saved >= config.train.checkpoint_every:
+                self._saving.save(at)
+                saved = now
+        self._check(metrics)
+        if metrics:
+            self._log(metrics)
+
+    def _is_to_stop(self, stop: StopRequest) -> bool:
+        """Several processes stop after the same rollout, or the others would wait for the one that does not come."""
+        return stop.name is not None if self._job.count == 1 else self._stop_agreed
+
+    def _step(self) -> int:
+        """How many steps each environment has made, below 0 while a run observes; seeds what is sampled."""
+        observing = self._to_observe * self._config.learner.rollout_length
+        return self.progress.env_steps // self._config.env.num_envs - observing
+
+    def _stay_in_touch(self, *, compiled: bool) -> None:
+        """Tells the watch that this process lives, once nothing is left to compile, and renews what it would save."""
+        if compiled:
+            self._watch.beat()
+        self._saving.refresh_copy(self.progress)
+
+    def _exchange(
+        self, outcomes: list[list[Outcome]], stop: StopRequest
+    ) -> tuple[list[list[Outcome]], list[dict[str, Any]]]:
+        """What all processes have to know of each other after a rollout: all outcomes, and the games as they stand."""
+        games = self._collector.get_state()
+        if self._job.count == 1:
+            return outcomes, games
+        stacked = [Outcome(*(np.stack(field, axis=1) for field in zip(*group, strict=True))) for group in outcomes]
+        told = {"outcomes": stacked, "games": games, "stop": np.array([stop.name is not None])}
+        told = self._job.gather(told)
+        self._stop_agreed = bool(told["stop"].any())
+        steps = [[Outcome(*step) for step in zip(*(f.T for f in group), strict=True)] for group in told["outcomes"]]
+        return steps, told["games"]
+
+    def _track(self, outcomes: list[list[Outcome]]) -> None:
+        for step in zip(*outcomes, strict=True):
+            self.progress.tracker.add(Outcome(*(np.concatenate(field) for field in zip(*step, strict=True))))
+
+    def _nearby(self, state: TrainState) -> TrainState:
+        """What acting needs of the state, on this process's devices."""
+        if self._layout is None:
+            return state
+        params, statistics = self._layout.nearby((state.params, state.statistics))
+        return state._replace(params=params, statistics=statistics)
+
+    def _check(self, metrics: list[Metrics]) -> None:
+        """Stops a run whose updates are not finite time after time."""
+        if not metrics:
+            return
+        if self._dump:
+            self._dump.look(metrics)
+        try:
+            check_finite(metrics, self._config.train.max_skipped, self.progress.env_steps)
+        except ConfigError:
+            self._log(metrics)
+            raise
+
+    def _log(self, metrics: list[Metrics]) -> None:
+        self._journal.row(self.progress.env_steps, metrics, self.progress.tracker, self._agent.num_actions)
+
+    def _abandon(self, why: str, code: int) -> int:
+        """The watchdog's last words, and the exit code: the main thread does not come back."""
+        self._saving.finish(self.progress)
+        if code:
+            report_fault(self._config, why, None)
+        elif self._saving.is_saved(self.progress):
+            self._journal.say(self._how_it_ends(why))
+            return code
+        else:
+            why, code = self._unsaved(), 2
+            self._journal.say(f"foajax: error: {why}")
+        if self._saving.checkpoints is not None:
+            note_failure(Path(self._config.run_dir), why)
+        return code
+
+    def _how_it_starts(self) -> str:
+        if not self.progress.env_steps:
+            parameters = self._config.train.init_from
+            begins = f", from the parameters of {parameters}" if parameters else ""
+            return f"new run of {self._config.name} on {self._config.game}{begins}"
+        games = "episodes go on" if self._collector.resumable else "episodes start anew, emulators cannot be saved"
+        return f"resumed at {self.progress.env_steps:,} env_steps ({games})"
+
+    def _unsaved(self) -> str:
+        reason = f"it stands at {self.progress.env_steps:,} env_steps, of which {self._saving.newest():,} are saved"
+        return str(refuse("run", self._config.run_dir, "a directory that can be written", why=reason))
+
+    def _how_it_ends(self, stop: str | None) -> str:
+        if stop is None:
+            return f"done: {self.progress.env_steps:,} env_steps"
+        if not self.progress.env_steps:
+            return f"{stop}: before anything was learned; the same command begins anew"
+        return f"{stop}: saved at {self.progress.env_steps:,} env_steps; the same command goes on from here"

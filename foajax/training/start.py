@@ -1,0 +1,90 @@
+"""Starts a run: from nothing, or from its newest checkpoint."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from pathlib import Path
+
+from foajax.config.parse import refuse
+from foajax.config.schema import Config, check_window
+from foajax.envs.atari import check_game
+from foajax.envs.make import make_environments
+from foajax.launch import processes
+from foajax.launch.signals import StopRequest
+from foajax.runs.agents import TrainedAgent, check_source, load_agent
+from foajax.runs.directory import is_run, open_run
+from foajax.runtime import use_compilation_cache
+from foajax.sensors.registry import make_sensor
+from foajax.training import profiling
+from foajax.training.run import Run
+
+
+def check(config: Config) -> None:
+    """Finds mistakes that a configuration does not show by itself; of a sweep, in all runs before the first one.
+
+    Raises:
+      ConfigError: no gaze and a focal area that is not the whole frame; no such game; no agent to begin with.
+    """
+    window, frame = make_sensor(config.sensor).window, config.env.frame_shape
+    check_window(config, window)
+    if config.gaze.mode == "none" and window != frame:
+        sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
+        raise refuse("gaze.mode", "none", f"a focal area {sizes}; or learned, frozen, random, scripted")
+    check_game(config)
+    if config.train.init_from is not None and not is_run(Path(config.run_dir)):  # one that goes on does not need it
+        check_source(config.train.init_from)
+
+
+def start(config: Config) -> None:
+    """Trains to `train.env_steps` or until a signal asks to stop; or profiles a short run.
+
+    Raises:
+      ConfigError: what `check` finds; the run's directory cannot be used, or is another run's.
+      EnvironmentFault: an environment raised.
+    """
+    check(config)
+    with contextlib.ExitStack() as resources:
+        if config.profile:
+            if config.train.devices > 1 or processes.where(config):
+                raise refuse("profile", True, "train.devices=1 and a single process")
+            environments = make_environments(config, 0)
+            for environment in environments:
+                resources.callback(environment.close)
+            profiling.profile(config, environments, f"{config.run_dir}/profile")
+            return
+        job = processes.start(config)
+        job.agree(config)
+        if config.train.dump_skipped and len(job.devices) > 1:
+            raise refuse("train.dump_skipped", True, "false where a run has several devices")
+        stop = resources.enter_context(StopRequest())
+        command = [sys.executable, *sys.argv]
+        devices = [device.device_kind for device in job.devices]
+        run_dir = job.by_first(
+            "run", lambda: resources.enter_context(open_run(config, command=command, devices=devices))
+        )
+        try:
+            run = Run(config, job, run_dir, resources)
+        except OSError as error:  # its files: whatever an environment raises is a fault of its own
+            reason = f"cannot be used ({error})"
+            raise refuse("run", config.run_dir, "a directory to write to", why=reason) from None
+        run.loop(stop)
+
+
+def train_agent(config: Config) -> TrainedAgent:
+    """Trains one agent, or goes on training it, in this process; gives it as its newest checkpoint has it.
+
+    As `python -m foajax.train` does, it writes to `config.run_dir`, prints to stderr and keeps compiled programs. It
+    may be called from any thread; in the main one, SIGINT, SIGTERM and SIGUSR1 end it early, with all that was learned
+    saved. An environment that hangs for longer than `env.timeout` ends the process.
+
+    Args:
+      config: from `foajax.compose([...])`.
+
+    Raises:
+      ConfigError: a run that cannot be made, or a directory that is another run's; one line for the user.
+      EnvironmentFault: an environment raised; what was learned is saved.
+    """
+    use_compilation_cache()
+    start(config)
+    return load_agent(config.run_dir, trust=True)

@@ -1,0 +1,1 @@
+"""Recorded games and their pictures: videos, heat maps, pages."""

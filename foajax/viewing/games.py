@@ -1,0 +1,87 @@
+"""Whole games of a trained agent with fixed parameters, for their scores."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from foajax.config.parse import refuse
+from foajax.envs.base import Environment
+from foajax.envs.make import make
+from foajax.runs.agents import TrainedAgent
+
+_SEEDS = 2**31  # seeds to choose from
+_WATCHED = 1_000_003  # keeps what `np.random.SeedSequence` makes of them apart from the seeds of training
+
+
+class Games(NamedTuple):
+    """Whole games, in the order in which they ended."""
+
+    returns: np.ndarray  # [episodes] unclipped
+    lengths: np.ndarray  # [episodes] agent steps
+    cut: int  # how many of them reached `env.max_episode_steps`
+
+
+def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool = False) -> Environment:
+    """What an agent is watched in: the game that it was trained in, with seeds apart from those of training.
+
+    Raises:
+      ConfigError: a seed out of range; no such game, or one whose actions are no longer those of the training.
+    """
+    if not 0 <= seed < _SEEDS:
+        raise refuse("seed", seed, f"an integer from 0 to {_SEEDS - 1}")
+    config, actions = stored.agent.config, stored.agent.num_actions
+    # An engine adds an environment's number to its seed: neighbouring seeds may not lie side by side.
+    first = int(np.random.SeedSequence([_WATCHED, seed]).generate_state(1)[0] >> 2)
+    made = make(config, num_envs=num_envs, seed=first, render=render)
+    if made.num_actions != actions:
+        made.close()
+        raise refuse("game", config.game, f"{actions}, as in training", why=f"has {made.num_actions} actions")
+    return made
+
+
+def play(
+    stored: TrainedAgent,
+    *,
+    episodes: int,
+    num_envs: int,
+    seed: int,
+    greedy: bool,
+    progress: Callable[[int], None] | None = None,
+) -> Games:
+    """Plays `episodes` games with fixed parameters; `progress` is told how many have ended, after each step.
+
+    Every environment plays the same number of games, to within one, so that short games are not over-represented.
+    """
+    num_envs = min(num_envs, episodes)
+    rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
+    watched = environment(stored, num_envs=num_envs, seed=seed)
+    act = jax.jit(functools.partial(stored.agent.act, greedy=greedy))
+    state = stored.agent.initial_state(num_envs)
+    key = jax.random.key(seed)
+    returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
+    finished: list[tuple[float, int, bool]] = []
+    timestep, _ = watched.reset()
+    step = 0
+    while len(finished) < episodes:
+        output, _, state = act(stored.params, stored.statistics, state, timestep, jax.random.fold_in(key, step))
+        watched.send(np.asarray(output.natural_action))
+        timestep, outcome = watched.recv()
+        returns += outcome.score
+        lengths += 1 - timestep.is_first
+        most = stored.agent.config.env.max_episode_steps
+        for i in np.flatnonzero(outcome.is_over):
+            if games[i] < rounds[i]:
+                finished.append((float(returns[i]), int(lengths[i]), bool(lengths[i] >= most)))
+            games[i] += 1
+            returns[i], lengths[i] = 0, 0
+        step += 1
+        if progress is not None:
+            progress(len(finished))
+    watched.close()
+    scores, steps, cut = map(np.array, zip(*finished, strict=True))
+    return Games(returns=scores, lengths=steps, cut=int(cut.sum()))

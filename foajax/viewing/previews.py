@@ -1,0 +1,49 @@
+"""What a training run shows of its gaze now and then: two small images from one rollout, for TensorBoard."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from foajax.sensors import gaze
+from foajax.types import Rollout
+
+_SCALE = 4  # pixels of an image for one of the frame
+_VIEWS = 6  # of one environment, spread over the rollout
+_GAP = 2
+
+
+def snapshots(rollout: Rollout, frame_shape: tuple[int, int]) -> dict[str, UInt8[np.ndarray, "_ _"]]:
+    """A heat map of the focal points of all environments, and what the first of them saw, by TensorBoard's names."""
+    steps = rollout.steps
+    return {
+        "gaze/heat_map": heat_map(np.asarray(steps.focal_point).reshape(-1, 2), frame_shape),
+        "gaze/views": views([np.asarray(part)[:, 0, :, :, 0] for part in steps.roi]),
+    }
+
+
+def heat_map(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> UInt8[np.ndarray, "_ _"]:
+    """How often the focal point was where: logarithmic, white for the most, on dark gray."""
+    counts = gaze.count(points, frame_shape)
+    levels = np.where(counts > 0, 80 + 175 * np.log1p(counts) / np.log1p(counts.max()), 24)
+    return _enlarged(levels)
+
+
+def views(parts: list[Float[np.ndarray, "T _ _"]]) -> UInt8[np.ndarray, "_ _"]:
+    """The sensor's images at a few steps, left to right, the parts of each below one another.
+
+    Values are normalised frames: the darkest is drawn black and the brightest white.
+    """
+    chosen = np.linspace(0, len(parts[0]) - 1, _VIEWS).astype(int)
+    low, high = (bound(np.stack([bound(part[chosen]) for part in parts])) for bound in (np.min, np.max))
+    width = max(part.shape[2] for part in parts)
+    rows = []
+    for part in parts:
+        margins = [(0, 0), (0, _GAP), (0, width - part.shape[2] + _GAP)]
+        levels = np.pad(255 * (part[chosen] - low) / max(high - low, 1e-6), margins)
+        rows.append(np.concatenate(list(levels), axis=1))
+    return _enlarged(np.concatenate(rows))
+
+
+def _enlarged(levels: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "_ _"]:
+    return np.kron(np.round(levels).astype(np.uint8), np.ones((_SCALE, _SCALE), np.uint8))

@@ -1,0 +1,253 @@
+"""Whole games of a trained agent, with all that it saw, thought and did. What every picture is made from."""
+
+from __future__ import annotations
+
+import functools
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from foajax.config.schema import Config
+from foajax.envs.atari import is_atari
+from foajax.envs.base import Environment
+from foajax.envs.make import action_names
+from foajax.learning.agent import Agent
+from foajax.runs.agents import TrainedAgent
+from foajax.sensors.sense import sense
+from foajax.types import ActorOutput, ActorState, FrameStatistics, NetworkOutput, Params, TimeStep
+from foajax.viewing import games
+
+OnStep = Callable[[int, float], None]  # told the steps played so far and the score
+
+
+class Screens(Sequence):
+    """Colour screens, uint8 [h, w, 3], each compressed: ten minutes of a game fit into some 30 MB."""
+
+    def __init__(self) -> None:
+        self._packed: list[bytes] = []
+        self.shape: tuple[int, ...] = (0, 0, 3)  # of each
+
+    def append(self, screen: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Adds one."""
+        self.shape = screen.shape
+        self._packed.append(zlib.compress(screen.tobytes(), 1))
+
+    def __len__(self) -> int:
+        return len(self._packed)
+
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return np.frombuffer(zlib.decompress(self._packed[index]), np.uint8).reshape(self.shape)
+
+
+class Recording(NamedTuple):
+    """One game, from its first screen to its last: N of them, and N decisions.
+
+    Row t is what was seen at t and what was decided upon it. `score` includes what the action at t - 1
+    earned. The action decided at the last row of a life or of the game has no effect.
+    """
+
+    config: Config
+    env_steps: int  # the agent has been trained for
+    seed: int
+    greedy: bool  # whether the agent took its likeliest actions, not sampled ones
+    actions: tuple[str, ...]  # names of the natural actions
+    crop_top: int | None  # screen row at which the frame begins; None where it is the whole screen
+    is_over: bool  # False where the recording was cut
+    screens: Screens
+    mean_frame: Float[np.ndarray, "H W"]  # over the game, 0 to 1
+    focal_point: Int[np.ndarray, "N 2"]  # (y, x) in frame pixels
+    images: tuple[UInt8[np.ndarray, "N _ _"], ...]  # the sensor's values in the packed layout, 255 times
+    natural_probs: Float[np.ndarray, "N A"]
+    natural_value: Float[np.ndarray, "N"]
+    natural_action: Int[np.ndarray, "N"]
+    vision_probs: Float[np.ndarray, "N V"] | None  # None where gaze is not learned, like its value
+    vision_value: Float[np.ndarray, "N"] | None
+    vision_action: Int[np.ndarray, "N"]
+    score: Float[np.ndarray, "N"]  # of the game so far, unclipped
+    lives: Int[np.ndarray, "N"] | None  # None where the game has none
+    is_first: np.ndarray  # bool [N]: the learner's episode starts, with memory and gaze reset
+
+    @property
+    def life_lost(self) -> np.ndarray:
+        """Bool [N]: the steps at which the game has a life fewer than before."""
+        if self.lives is None:
+            return np.zeros(len(self.score), bool)
+        return np.diff(self.lives, prepend=self.lives[0]) < 0
+
+    @property
+    def frame_origin(self) -> tuple[float, float, float]:
+        """Screen row at which the frame begins; screen pixels for a frame pixel, down and across."""
+        height, width = self.config.env.frame_shape
+        if self.crop_top is None:
+            return 0.0, self.screens.shape[0] / height, self.screens.shape[1] / width
+        return float(self.crop_top), 2.0, 2.0
+
+
+class _Row(NamedTuple):
+    """What one step adds to a recording, still on the device."""
+
+    output: ActorOutput
+    network: NetworkOutput
+    images: list[Array]
+
+
+def record(
+    stored: TrainedAgent,
+    *,
+    episodes: int = 1,
+    seed: int = 0,
+    greedy: bool = False,
+    max_steps: int | None = None,
+    progress: OnStep | None = None,
+) -> Iterator[Recording]:
+    """Plays whole games, one after another; each is the first one of `evaluate` with its seed and one environment.
+
+    Args:
+      stored: the agent.
+      episodes: how many games.
+      seed: of the first game, and of what is sampled in it; the next one has the next seed.
+      greedy: whether the likeliest actions are taken.
+      max_steps: cuts a game after so many decisions; None for a whole one.
+      progress: called after each step.
+
+    Raises:
+      ConfigError: if there is no such game.
+    """
+    config = stored.agent.config
+    names = action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
+    decide = jax.jit(functools.partial(_decide, stored.agent, greedy))
+    for game in range(seed, seed + episodes):
+        environment = games.environment(stored, num_envs=1, seed=game, render=_in_colour(config))
+        try:
+            played = _play(environment, stored, decide, jax.random.key(game), max_steps, progress)
+        finally:
+            environment.close()
+        yield Recording(
+            config=config,
+            env_steps=stored.env_steps,
+            seed=game,
+            greedy=greedy,
+            actions=names,
+            crop_top=stored.agent.crop_top,
+            **played,
+        )
+
+
+def _play(
+    environment: Environment,
+    stored: TrainedAgent,
+    decide: Callable[..., tuple[_Row, Array, ActorState]],
+    key: PRNGKeyArray,
+    max_steps: int | None,
+    progress: OnStep | None,
+) -> dict[str, Any]:
+    """One game: the fields of a recording that come from playing."""
+    config, state = stored.agent.config, stored.agent.initial_state(1)
+    timestep, outcome = environment.reset()
+    screens, total = Screens(), np.zeros(config.env.frame_shape)
+    rows: list[_Row] = []
+    scores: list[float] = []
+    lives: list[int] = []
+    while True:
+        step_key = jax.random.fold_in(key, len(rows))
+        row, frame, state = decide(stored.params, stored.statistics, state, timestep, step_key)
+        screens.append(environment.render()[0] if _in_colour(config) else _gray(np.asarray(timestep.frame)[0]))
+        scores.append((scores[-1] if scores else 0.0) + float(outcome.score[0]))
+        lives.append(0 if environment.lives is None else int(environment.lives[0]))
+        rows.append(jax.device_get(row))
+        total += np.asarray(frame)
+        if progress is not None:
+            progress(len(rows), scores[-1])
+        if outcome.is_over[0] or len(rows) == max_steps:
+            break
+        environment.send(np.asarray(row.output.natural_action))
+        timestep, outcome = environment.recv()
+        if outcome.is_over[0] and timestep.is_first[0]:
+            break  # the engine tells of the game's end only with the next one's first screen
+    return {
+        "is_over": bool(outcome.is_over[0]),
+        "screens": screens,
+        "mean_frame": (total / len(rows)).astype(np.float32),
+        "score": np.array(scores, np.float32),
+        "lives": np.array(lives) if any(lives) else None,
+        **_columns(rows),
+    }
+
+
+def _decide(
+    agent: Agent,
+    greedy: bool,
+    params: Params,
+    statistics: FrameStatistics,
+    state: ActorState,
+    timestep: TimeStep,
+    key: PRNGKeyArray,
+) -> tuple[_Row, Float[Array, "H W"], ActorState]:
+    """One decision, with the frame and what the packed sensor gives of it before normalisation."""
+    output, network, state = agent.act(params, statistics, state, timestep, key, greedy=greedy)
+    frame = agent.frame(timestep.frame)[0]
+    images = sense(frame, output.focal_point[0], sensor=agent.sensor.packed)
+    levels = [jnp.round(255 * image[..., 0]).astype(jnp.uint8) for image in images]
+    return _Row(output._replace(roi=(), frames=()), network, levels), frame, state
+
+
+def _in_colour(config: Config) -> bool:
+    """Whether the engine can show screens in colour; ale-py's vector environment keeps gray ones only."""
+    return config.env.engine != "ale" or not is_atari(config)
+
+
+def _columns(rows: Sequence[_Row]) -> dict[str, Any]:
+    """The fields of a recording that are the decisions' fields, row after row."""
+    outputs, networks, images = zip(*rows, strict=True)
+    learned = networks[0].vision_logits is not None
+
+    def column(records: Sequence, name: str) -> np.ndarray:
+        return np.concatenate([getattr(each, name) for each in records])
+
+    return {
+        "focal_point": column(outputs, "focal_point"),
+        "images": tuple(np.stack(part) for part in zip(*images, strict=True)),
+        "natural_probs": _softmax(column(networks, "natural_logits")),
+        "natural_value": column(networks, "natural_value"),
+        "natural_action": column(outputs, "natural_action"),
+        "vision_probs": _softmax(column(networks, "vision_logits")) if learned else None,
+        "vision_value": column(networks, "vision_value") if learned else None,
+        "vision_action": column(outputs, "vision_action"),
+        "is_first": column(outputs, "is_first"),
+    }
+
+
+def _softmax(logits: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+    exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return exponentials / exponentials.sum(axis=-1, keepdims=True)
+
+
+def _gray(screen: np.ndarray) -> np.ndarray:
+    return np.repeat(screen[..., None], 3, axis=-1)
+
+
+def play(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
+    """`record`, with a bar for each game while it is played."""
+
+    def progress(steps: int, score: float) -> None:
+        bar.update(task, completed=steps, note=f"{steps:,} steps, score {score:g}")
+
+    games = record(stored, episodes=episodes, seed=seed, progress=progress, **how)
+    for game in range(seed, seed + episodes):
+        task = bar.add_task(f"game {game}", total=how["max_steps"], note="starts")
+        yield next(games)
+        bar.update(task, total=bar.tasks[task].completed)
+
+
+def progress_bar() -> Progress:
+    """Bars with a note at their end."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
+    return Progress(*columns)

@@ -1,0 +1,167 @@
+"""What sensors see of one frame, drawn side by side; the brightest pixel of the frame is drawn white."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+
+from foajax.config.parse import refuse
+from foajax.sensors.base import Sensor
+from foajax.sensors.sense import picture, sense
+from foajax.viewing.style import draw_gaze
+
+PAPER = (
+    "nonfoa",
+    "constant50_sub1",
+    "constant50_sub2",
+    "constant70",
+    "decreasing",
+    "constant70_p",
+    "decreasing_p",
+)  # in the order of Table II
+ALL = (*PAPER, "logpolar")
+
+_SIDE = 240  # of a panel, pixels: about three for each of an 80x80 frame
+_GAP = 12
+_LINE = 18  # of text
+_INK, _FAINT, _PAPER = "#222222", "#777777", "#ffffff"
+
+Panel = tuple[str, Image.Image]  # caption and picture
+
+
+def draw(frame: np.ndarray, sensor: Sensor, points: Sequence[tuple[int, int]], *, name: str) -> Image.Image:
+    """One sensor on one frame: a heading and a row for each focal point.
+
+    Args:
+      frame: float32 [H, W] in [0, 1].
+      sensor: what to look through.
+      points: (y, x) in frame pixels, inside the frame.
+      name: of the sensor, for the heading.
+    """
+    rows = [_row(_panels(frame, sensor, point)) for point in points]
+    return _headed(_stack(rows), *_heading(frame, sensor, name))
+
+
+def contact_sheet(frame: np.ndarray, sensors: dict[str, Sensor], points: Sequence[tuple[int, int]]) -> Image.Image:
+    """Several sensors on one frame, two abreast; each with a pair of panels for every focal point."""
+    blocks = [
+        _headed(
+            _stack([_row(_panels(frame, sensor, point)[:2]) for point in points]),
+            *_heading(frame, sensor, name),
+        )
+        for name, sensor in sensors.items()
+    ]
+    return _stack([_beside(blocks[i : i + 2]) for i in range(0, len(blocks), 2)])
+
+
+def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[Panel]:
+    """The frame, what is seen of it, and the packed images."""
+    images, seen = _look(jnp.asarray(frame), jnp.asarray(point, jnp.int32), sensor)
+    white = float(frame.max()) or 1.0
+    panels = [
+        (f"frame, gaze at y {point[0]}, x {point[1]}", _marked(frame / white, sensor, point)),
+        ("what the sensor shows", _grey(np.asarray(seen)[..., 0] / white)),
+    ]
+    if sensor.in_place:
+        return panels
+    for i, image in enumerate(images):
+        caption = f"image {i}: {image.shape[0]} x {image.shape[1]}"
+        panels.append((caption, _grey(np.asarray(image)[..., 0] / white)))
+    return panels
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _look(
+    frame: Float[Array, "H W"], focal_point: Int[Array, "2"], sensor: Sensor
+) -> tuple[tuple[Float[Array, "_ _ 1"], ...], Float[Array, "H W 1"]]:
+    """What the sensor gives, and that put back in its place."""
+    images = sense(frame, focal_point, sensor=sensor)
+    shape = (frame.shape[0], frame.shape[1])
+    return images, picture(images, focal_point, sensor=sensor, frame_shape=shape)
+
+
+def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.Image:
+    """The frame with the focal areas and the focal point drawn on it."""
+    image = _grey(frame)
+    scale = image.width // frame.shape[1]
+    draw_gaze(image, sensor, point, scale=(scale, scale))
+    return image
+
+
+def _grey(values: np.ndarray) -> Image.Image:
+    """Values in [0, 1] as an image, each a square of pixels."""
+    scale = max(1, _SIDE // max(values.shape))
+    levels = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    image = Image.fromarray(levels).convert("RGB")
+    return image.resize((scale * image.width, scale * image.height), Image.Resampling.NEAREST)
+
+
+def _row(panels: Sequence[Panel]) -> Image.Image:
+    """Panels side by side, each under its caption."""
+    font, blocks = ImageFont.load_default(12), []
+    for caption, image in panels:
+        width = max(image.width + 2, round(font.getlength(caption)))
+        block = Image.new("RGB", (width, image.height + 2 + _LINE), _PAPER)
+        ImageDraw.Draw(block).text((0, 0), caption, fill=_FAINT, font=font)
+        # White pixels are to end somewhere on a white page.
+        block.paste(ImageOps.expand(image, 1, _FAINT), (0, _LINE))
+        blocks.append(block)
+    return _beside(blocks)
+
+
+def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
+    """The sensor's name, and its pixel budget as Table II counts it."""
+    count = sensor.count((frame.shape[0], frame.shape[1]))
+    shown = "" if count.actual == count.nominal else f" ({count.actual:,} shown)"
+    return name, f"{count.nominal:,} values{shown}, {100 * count.nominal / frame.size:.0f}% of the frame"
+
+
+def _headed(image: Image.Image, title: str, note: str) -> Image.Image:
+    """An image under a heading."""
+    large, small = ImageFont.load_default(16), ImageFont.load_default(12)
+    start = round(large.getlength(title)) + _GAP
+    width = max(image.width, start + round(small.getlength(note)))
+    headed = Image.new("RGB", (width, image.height + _LINE + _GAP // 2), _PAPER)
+    pen = ImageDraw.Draw(headed)
+    pen.text((0, 14), title, fill=_INK, font=large, anchor="ls")
+    pen.text((start, 14), note, fill=_FAINT, font=small, anchor="ls")
+    headed.paste(image, (0, _LINE + _GAP // 2))
+    return headed
+
+
+def _beside(images: Sequence[Image.Image]) -> Image.Image:
+    """Images from left to right, their tops aligned."""
+    width = sum(image.width for image in images) + _GAP * (len(images) - 1)
+    joined = Image.new("RGB", (width, max(image.height for image in images)), _PAPER)
+    left = 0
+    for image in images:
+        joined.paste(image, (left, 0))
+        left += image.width + _GAP
+    return joined
+
+
+def _stack(images: Sequence[Image.Image]) -> Image.Image:
+    """Images from top to bottom."""
+    height = sum(image.height for image in images) + _GAP * (len(images) - 1)
+    joined = Image.new("RGB", (max(image.width for image in images), height), _PAPER)
+    top = 0
+    for image in images:
+        joined.paste(image, (0, top))
+        top += image.height + _GAP
+    return joined
+
+
+def save(image: Image.Image, out: str) -> None:
+    """Writes a PNG with a margin; 64 colours are enough for grey levels, rings and text."""
+    page = Image.new("RGB", (image.width + 2 * _GAP, image.height + 2 * _GAP), _PAPER)
+    page.paste(image, (_GAP, _GAP))
+    try:
+        page.quantize(64, dither=Image.Dither.NONE).save(out, optimize=True)
+    except OSError as error:
+        raise refuse("out", out, f"a file that can be written ({error.strerror})") from None

@@ -1,0 +1,64 @@
+"""What every picture of the gaze shares: colours, and the outlines of the focal areas."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from PIL import Image, ImageDraw
+
+from foajax.sensors.base import Sensor, boxes
+
+RINGS = ("#ffb000", "#2fb8ff", "#ff5c9a")  # inner to outer, told apart by the colour-blind too
+NATURAL, VISION = "#58d68d", "#b794ff"  # the two heads
+HALO = "#000000"  # under a line that has to show on any screen
+
+Number = int | float
+
+STYLE: Any = {  # of figures: Matplotlib's keys
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#777777",
+    "axes.labelcolor": "#222222",
+    "xtick.color": "#777777",
+    "ytick.color": "#777777",
+    "xtick.labelcolor": "#222222",
+    "ytick.labelcolor": "#222222",
+    "legend.frameon": False,
+    "svg.hashsalt": "foajax",  # the same figure, the same file
+}
+
+
+def draw_gaze(
+    image: Image.Image,
+    sensor: Sensor,
+    point: tuple[int, int],
+    *,
+    scale: tuple[Number, Number],
+    top: Number = 0,
+    halo: bool = False,
+) -> None:
+    """Draws the focal areas and a cross at the focal point.
+
+    Args:
+      image: changed in place.
+      sensor: whose areas.
+      point: (y, x) in frame pixels.
+      scale: pixels of the image for one of the frame, (down, across).
+      top: row of the image at which the frame begins.
+      halo: whether lines get a dark rim.
+    """
+    pen = ImageDraw.Draw(image)
+    down, across = scale
+    shape = pen.ellipse if sensor.is_round else pen.rectangle
+    for i, (y, x, height, width) in reversed(list(enumerate(boxes(sensor, point)))):
+        left, upper = round(across * x), round(top + down * y)
+        right, lower = round(across * (x + width)) - 1, round(top + down * (y + height)) - 1
+        if halo:
+            shape([left - 1, upper - 1, right + 1, lower + 1], outline=HALO, width=4)
+        shape([left, upper, right, lower], outline=RINGS[i % len(RINGS)], width=2)
+    y, x = round(top + down * point[0]), round(across * point[1])
+    for reach, width, colour in ((6, 4, HALO), (5, 2, RINGS[0])) if halo else ((5, 2, RINGS[0]),):
+        pen.line([x - reach, y, x + reach, y], fill=colour, width=width)
+        pen.line([x, y - reach, x, y + reach], fill=colour, width=width)

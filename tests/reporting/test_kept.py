@@ -1,0 +1,80 @@
+"""Runs that are kept: what is copied of a run, and what the tables say of it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+
+import pytest
+
+from foajax.config.compose import compose
+from foajax.config.parse import ConfigError, flatten, to_mapping
+from foajax.reporting import kept
+from foajax.runs.directory import FREE, load_config
+
+RUNS = [path for path in sorted(kept.KEPT.glob("*/*")) if path.is_dir()]
+
+
+@pytest.mark.parametrize("path", RUNS, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_the_command_of_a_kept_run_makes_it(path):
+    facts = json.loads((path / "run.json").read_text())
+    words = shlex.split(facts["command"].removeprefix("python -m foajax.train "))
+    asked, made = (dict(flatten(to_mapping(config))) for config in (compose(words), load_config(path)))
+    assert {key for key in asked | made if asked.get(key) != made.get(key)} <= FREE
+    assert facts["starts"][-1]["commit"] and facts["hours"] > 0
+
+
+@pytest.mark.parametrize("path", RUNS, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_a_kept_run_is_in_the_table_with_its_score(path):
+    score = json.loads((path / "score.json").read_text())
+    assert len(score["returns"]) == score["episodes"] >= 100
+    row = next(
+        line
+        for line in (kept.KEPT / "README.md").read_text().splitlines()
+        if f"({path.parent.name}/{path.name})" in line
+    )
+    assert f"{score['mean']:.1f} ± {score['stderr']:.1f}" in row
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A finished run of seek, evaluated; `kept.KEPT` is elsewhere."""
+    monkeypatch.setattr(kept, "KEPT", tmp_path / "kept")
+    path = tmp_path / "seek-seek-s3"
+    (path / "checkpoints" / "2000").mkdir(parents=True)
+    config = compose(["experiment=seek", "seed=3", "train.env_steps=2000"])
+    import yaml
+
+    (path / "config.yaml").write_text(yaml.safe_dump(to_mapping(config)))
+    start = {"time": "2026-11-27T21:00:00+00:00", "commit": "abc", "command": ["python", "experiment=seek", "seed=3"]}
+    (path / "run.json").write_text(json.dumps({"starts": [start | {"cpu": "a processor", "cores": 2}]}))
+    rows = [{"env_steps": step, "time": step / 100, "score": step / 200} for step in range(2, 2002, 2)]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    score = {
+        "env_steps": 2000,
+        "policy": "sampled",
+        "episodes": 100,
+        "mean": 9.0,
+        "stderr": 0.5,
+        "returns": [9.0] * 100,
+    }
+    (path / "score.json").write_text(json.dumps(score))
+    return path
+
+
+def test_a_run_is_kept_by_game_experiment_and_seed(run):
+    out = kept.keep(run, None)
+    assert out == kept.KEPT / "seek" / "seek-s3"
+    assert len((out / "metrics.jsonl").read_text().splitlines()) == 500
+    assert json.loads((out / "run.json").read_text())["command"] == "python -m foajax.train experiment=seek seed=3"
+    kept.write_tables(kept.KEPT)
+    table = (kept.KEPT / "README.md").read_text()
+    assert "| seek | `seek` | 3 | 281 | learned | 0.0 M | 0.0 | 9.0 ± 0.5 | [seek/seek-s3](seek/seek-s3) |" in table
+    assert (kept.KEPT / "seek.png").stat().st_size > 1000
+
+
+def test_a_score_of_fewer_games_is_refused(run):
+    score = json.loads((run / "score.json").read_text())
+    (run / "score.json").write_text(json.dumps(score | {"episodes": 30}))
+    with pytest.raises(ConfigError, match="score.json has .*30.*accepted is .*100"):
+        kept.keep(run, None)

@@ -1,0 +1,131 @@
+"""The focal point: moves, bounds, starts and scripts against a walk in plain Python."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from foajax.config.parse import ConfigError
+from foajax.config.schema import GazeConfig
+from foajax.sensors import gaze
+
+FRAME = (80, 90)
+WINDOWS = [(70, 70), (71, 33), (80, 90), (1, 1)]
+MOVES = {0: (0, 0), 1: (-1, 0), 2: (1, 0), 3: (0, -1), 4: (0, 1), 5: (-1, -1), 6: (-1, 1), 7: (1, -1), 8: (1, 1)}
+
+
+def oracle_limits(bounds, window, frame_shape):
+    """All coordinates, per axis, at which the area (or the point alone) lies in the frame."""
+    allowed = []
+    for length, size in zip(window, frame_shape, strict=True):
+        span = range(size)
+        if bounds == "window":
+            span = [p for p in span if p - length // 2 >= 0 and p - length // 2 + length <= size]
+        allowed.append((min(span), max(span)))
+    return allowed
+
+
+@pytest.mark.parametrize("bounds", ["window", "point"])
+@pytest.mark.parametrize("window", WINDOWS)
+def test_limits_are_where_the_area_fits(bounds, window):
+    low, high = gaze.limits(gaze=GazeConfig(bounds=bounds), window=window, frame_shape=FRAME)
+    assert list(zip(low.tolist(), high.tolist(), strict=True)) == oracle_limits(bounds, window, FRAME)
+
+
+def test_limits_by_hand():
+    low, high = gaze.limits(gaze=GazeConfig(), window=(70, 70), frame_shape=(80, 80))
+    assert low.tolist() == [35, 35] and high.tolist() == [45, 45]
+
+
+@pytest.mark.parametrize("bounds", ["window", "point"])
+@pytest.mark.parametrize("actions", [5, 9])
+def test_a_random_walk_matches_plain_python(bounds, actions):
+    """Eight walks at once, from different points, until they have met all borders."""
+    config, window = GazeConfig(actions=actions, step=7, bounds=bounds), (30, 20)
+    rng = np.random.default_rng(actions)
+    chosen = rng.integers(0, actions, (60, 8))
+    points = np.stack([rng.integers(15, 66, 8), rng.integers(10, 81, 8)], 1)
+    limits = oracle_limits(bounds, window, FRAME)
+    move = functools.partial(gaze.move, gaze=config, window=window, frame_shape=FRAME)
+    step = jax.jit(jax.vmap(move))
+    now = jnp.asarray(points, jnp.int32)
+    for actions_now in chosen:
+        for row, action in enumerate(actions_now):
+            for axis in (0, 1):
+                moved = points[row, axis] + 7 * MOVES[int(action)][axis]
+                points[row, axis] = min(max(moved, limits[axis][0]), limits[axis][1])
+        now = step(now, jnp.asarray(actions_now))
+        assert now.dtype == jnp.int32
+        np.testing.assert_array_equal(now, points)
+    alone = move(now[0], jnp.int32(1))
+    np.testing.assert_array_equal(alone, step(now, jnp.ones(8, jnp.int32))[0])
+
+
+def test_five_actions_by_hand():
+    config = GazeConfig(step=4, bounds="point")
+    moved = [
+        gaze.move(jnp.array([40, 50]), jnp.int32(a), gaze=config, window=(70, 70), frame_shape=FRAME) for a in range(5)
+    ]
+    assert [p.tolist() for p in moved] == [[40, 50], [36, 50], [44, 50], [40, 46], [40, 54]]
+
+
+@pytest.mark.parametrize(
+    ("first", "bounds", "window", "frame_shape", "wanted"),
+    [
+        ("centre", "window", (70, 70), (80, 80), [40, 40]),
+        ("centre", "window", (79, 81), (81, 81), [40, 40]),
+        ("centre", "point", (70, 70), (31, 20), [15, 10]),
+        ((3, 79), "window", (70, 70), (80, 80), [35, 45]),
+        ((3, 79), "point", (70, 70), (80, 80), [3, 79]),
+    ],
+)
+def test_a_given_start_is_kept_within_bounds(first, bounds, window, frame_shape, wanted):
+    config = GazeConfig(start=first, bounds=bounds)
+    point = gaze.start(jax.random.key(0), gaze=config, window=window, frame_shape=frame_shape)
+    assert point.tolist() == wanted and point.dtype == jnp.int32
+
+
+@pytest.mark.parametrize(("bounds", "count"), [("window", 4 * 3), ("point", 7 * 6)])
+def test_a_random_start_is_uniform_within_bounds(bounds, count):
+    config = GazeConfig(start="random", bounds=bounds)
+    keys = jax.random.split(jax.random.key(1), 6000)
+    begin = functools.partial(gaze.start, gaze=config, window=(4, 4), frame_shape=(7, 6))
+    points = jax.jit(jax.vmap(begin))(keys)
+    places, hits = np.unique(points, axis=0, return_counts=True)
+    assert len(places) == count
+    (top, bottom), (left, right) = oracle_limits(bounds, (4, 4), (7, 6))
+    assert places.min(0).tolist() == [top, left] and places.max(0).tolist() == [bottom, right]
+    mean = 6000 / count
+    assert np.abs(hits - mean).max() < 5 * np.sqrt(mean)
+    np.testing.assert_array_equal(begin(keys[3]), points[3])
+
+
+def test_a_script_repeats_and_is_kept_within_bounds():
+    config = GazeConfig(mode="scripted", path=((40, 40), (0, 42), (79, 79)))
+    follow = functools.partial(gaze.scripted, gaze=config, window=(70, 70), frame_shape=(80, 80))
+    points = jax.jit(jax.vmap(follow))(jnp.arange(7))
+    wanted = [(40, 40), (35, 42), (45, 45)] * 3
+    np.testing.assert_array_equal(points, wanted[:7])
+    np.testing.assert_array_equal(follow(jnp.int32(4)), wanted[4])
+
+
+def test_unit_coordinates_by_hand_and_back():
+    units = gaze.to_unit(jnp.array([[0, 0], [40, 45], [20, 89]]), FRAME)
+    np.testing.assert_allclose(units, [[-1, -1], [0, 0], [-0.5, 89 / 45 - 1]], atol=1e-6)
+    np.testing.assert_array_equal(units[1], 0)
+    points = jnp.asarray([(y, x) for y in range(80) for x in range(90)], jnp.int32)
+    there = jax.vmap(functools.partial(gaze.to_unit, frame_shape=FRAME))(points)
+    assert there.min() >= -1 and there.max() < 1
+    np.testing.assert_array_equal(jax.jit(gaze.from_unit, static_argnums=1)(there, FRAME), points)
+    np.testing.assert_array_equal(gaze.from_unit(jnp.array([1.0, -3.0]), FRAME), [79, 0])
+
+
+def test_errors_name_the_key():
+    with pytest.raises(ConfigError, match=r"gaze\.bounds=window: .*\(81, 20\)"):
+        gaze.limits(gaze=GazeConfig(), window=(81, 20), frame_shape=FRAME)
+    with pytest.raises(ConfigError, match=r"gaze\.path=\[\]: accepted is at least one"):
+        gaze.scripted(jnp.int32(0), gaze=GazeConfig(), window=(1, 1), frame_shape=FRAME)

@@ -1,0 +1,63 @@
+"""foajax.reproduce: the stages are what the paper compares, finished runs are skipped, the rest is listed."""
+
+from __future__ import annotations
+
+import json
+import shlex
+
+import pytest
+
+from foajax import cli, reproduce
+from foajax.config.compose import compose
+from foajax.launch import sweep
+
+SENSORS = {
+    *("nonfoa", "constant50_sub1_packed", "constant50_sub2_packed", "constant70_packed", "decreasing_packed"),
+    *("constant70_p_packed", "decreasing_p_packed"),
+}
+
+
+@pytest.fixture
+def short(tmp_path, monkeypatch):
+    """One stage of two short runs of seek, in a directory of the test's."""
+    lines = ["experiment=seek seed=0,1 train.env_steps=640 env.num_envs=4 train.log_every=0.1"]
+    monkeypatch.setattr(reproduce, "stages", lambda: [{"about": "a short stage", "runs": lines}])
+    monkeypatch.setattr(reproduce, "_EPISODES", 2)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_each_game_has_the_papers_seven_sensors():
+    runs = [run.config for stage in reproduce.stages() for line in stage["runs"] for run in sweep.expand(line.split())]
+    for game, steps in (("breakout", 3_000_000), ("pong", 1_500_000), ("beam_rider", 3_000_000)):
+        first = [c for c in runs if c.game == game and c.seed == 0 and c.name in SENSORS]
+        assert {c.name for c in first} == SENSORS and {c.train.env_steps for c in first} == {steps}
+    assert len({config.run_dir for config in runs}) == len(runs)
+
+
+def test_commands_of_what_is_left(capsys):
+    assert cli.run(reproduce.reproduce, ["stage=2", "show=commands"]) == 0
+    commands = capsys.readouterr().out.splitlines()
+    configs = [compose(shlex.split(line.removeprefix("python -m foajax.train "))) for line in commands]
+    assert [config.gaze.mode for config in configs] == ["frozen", "random", "scripted", "learned"]
+    assert configs[-1].sensor.layout == "canvas"
+
+
+def test_a_stage_is_trained_evaluated_and_then_left_alone(short, capsys):
+    assert cli.run(reproduce.reproduce, ["jobs=2"]) == 0
+    for seed in (0, 1):
+        assert json.loads((short / f"runs/seek-seek-s{seed}/score.json").read_text())["episodes"] == 2
+    capsys.readouterr()
+    assert cli.run(reproduce.reproduce, ["jobs=2"]) == 0
+    assert capsys.readouterr().err.count("finished already") == 2
+    assert cli.run(reproduce.reproduce, ["show=table"]) == 0
+    assert capsys.readouterr().out.count("finished") == 2
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [("stage=0", "stage=0: accepted is null or an integer from 1 to 6"), ("jobs=0", "jobs=0: accepted is")],
+)
+def test_what_cannot_be_is_refused(capsys, word, said):
+    assert cli.run(reproduce.reproduce, [word]) == 2
+    assert capsys.readouterr().err.startswith(f"foajax: error: {said}")
