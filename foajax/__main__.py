@@ -18,6 +18,7 @@ COMMANDS = {
     "cost": "Measures what a decision costs, sensor by sensor.",
     "status": "Shows what every run below some directories is doing.",
     "reproduce": "Runs the paper's comparison, stage by stage.",
+    "export": "Writes a folder that runs an agent without JAX and foajax.",
     "store": "Makes an agent to be shipped from a run.",
     "keep": "Keeps in results/runs/ what others need to judge and repeat a run.",
 }

@@ -6,6 +6,9 @@ already; no game is started. FLOPs are XLA's count of the program *before* it is
 depend on neither the device nor what XLA fuses; but a loop counts as one turn, and thus the sensor's
 repair of an area that overhangs the frame counts even where none does. Times are medians of repeats
 that take turns, so that whatever else the machine does slows all experiments alike.
+
+`target=onnx` times the folders that `foajax.export` writes, from a screen and from a camera's image to the next focal
+point, on one thread (extra `robot`).
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from rich.table import Table
 
 from foajax import cli
 from foajax.config.compose import list_experiments
-from foajax.config.parse import Section
+from foajax.config.parse import Section, refuse
 from foajax.reporting.cost import BATCHES, PARTS, REFERENCE, measure
 from foajax.runtime import wait_in_place
 
@@ -36,6 +39,8 @@ class Options(Section):
     torso: Literal["nature", "a3c"] = Field("nature", description="Choice of the group network/.")
     json_file: str | None = Field(None, alias="json", description="File for the result.")
     repeats: int = Field(50, ge=1, description="Repeats of each timing.")
+    target: Literal["jax", "onnx"] = Field("jax", description="What runs: JAX, or the folders that export writes.")
+    dtype: Literal["float32", "float16", "int8"] = Field("float32", description="Of the weights, where target=onnx.")
 
     def check(self) -> None:
         cli.check_file("json", self.json_file)
@@ -46,10 +51,22 @@ def cost(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     wait_in_place()
     names = list_experiments() if options.experiments is None else options.experiments.split(",")
-    records = measure(names, torso=options.torso, repeats=options.repeats)
-    _print(records)
+    if options.target == "onnx":
+        records = _exported(names, options)
+        _print_exported(records)
+    else:
+        records = measure(names, torso=options.torso, repeats=options.repeats)
+        _print(records)
     if options.json_file:
         cli.write_json("json", options.json_file, records)
+
+
+def _exported(names: Sequence[str], options: Options) -> list[dict[str, Any]]:
+    try:
+        from foajax.robot import latency
+    except ImportError as error:
+        raise refuse("target", "onnx", "foajax[robot]", why=f"{error.name} is missing") from None
+    return latency.measure(names, torso=options.torso, dtype=options.dtype, repeats=options.repeats)
 
 
 def _print(records: Sequence[dict[str, Any]]) -> None:
@@ -79,6 +96,30 @@ def _print(records: Sequence[dict[str, Any]]) -> None:
     console.print(table)
     device = f"{jax.devices()[0].device_kind}, host {platform.machine()} with {os.cpu_count()} cores"
     console.print(f"Ratios are to {REFERENCE}. {device}, jax {jax.__version__}.")
+
+
+def _print_exported(records: Sequence[dict[str, Any]]) -> None:
+    table = Table(box=box.SIMPLE, title=f"ONNX Runtime, {records[0]['dtype']}; us, median | 99%")
+    headings = ("frame", "sense", "torso", "network", "screen", "camera", "JAX, screen")
+    for heading in ("experiment", *headings, "ratio", "MB", "memory MB", "start s", "energy est. uJ"):
+        table.add_column(heading, no_wrap=True, justify="left" if heading == "experiment" else "right")
+    for record in records:
+        parts = ("frame", "sense", "torso", "network", "screen", "camera", "jax_screen")
+        table.add_row(
+            record["experiment"],
+            *(f"{record[f'{part}_us']:,.0f} | {record[f'{part}_us_p99']:,.0f}" for part in parts),
+            f"{record['screen_ratio']:.2f}",
+            f"{record['bytes'] / 1e6:.1f}",
+            f"{record['memory_mb']:.0f}",
+            f"{record['start_s']:.2f}",
+            f"{record['screen_energy_estimate_uj']:.0f}",
+        )
+    console = Console(width=170, highlight=False)
+    console.print(table)
+    console.print(
+        "frame, sense and network make up screen, a whole decision; torso is a part of network. Energy is an estimate "
+        "from operations and bytes read."
+    )
 
 
 if __name__ == "__main__":

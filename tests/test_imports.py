@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-ORDER = "config | sensors networks envs | learning | runs | viewing launch | reporting training"
+ORDER = "config | sensors networks envs | learning | runs | viewing launch | reporting training | robot"
 RANK = {package: rank for rank, row in enumerate(ORDER.split("|")) for package in row.split()}
 OPEN = {"types": set(), "runtime": set(), "cli": {"config"}}  # to everyone; and what of ours they import themselves
 ONLY_IN = {"hydra": {"config", "launch"}, "omegaconf": {"config", "launch"}, "envpool": {"envs"}, "flax": {"networks"}}

@@ -111,6 +111,11 @@ def flops(function: Callable[..., Any], *arguments: Any) -> int:
     return int(analysis["flops"])
 
 
+def count(config: Config) -> dict[str, Any]:
+    """What is counted of a run's decision: the same on every machine."""
+    return _subject(config).exact
+
+
 def _subject(config: Config) -> Subject:
     agent = Agent(config, num_actions=_NUM_ACTIONS, crop_top=None)
     shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
@@ -129,13 +134,13 @@ def _count(agent: Agent, params: Params) -> dict[str, Any]:
     config = agent.config
     frame, focal_point, core_state, key = _inputs(agent, 1)
     roi = jax.eval_shape(functools.partial(sense, agent), frame, focal_point)
-    count = agent.sensor.count(config.env.frame_shape)
+    pixels = agent.sensor.count(config.env.frame_shape)
     return {
         "experiment": config.name,
         "torso": config.network.torso,
-        "pixels_nominal": count.nominal,
-        "pixels_actual": count.actual,
-        "pixels_ratio": count.actual / math.prod(config.env.frame_shape),
+        "pixels_nominal": pixels.nominal,
+        "pixels_actual": pixels.actual,
+        "pixels_ratio": pixels.actual / math.prod(config.env.frame_shape),
         "torso_flops": flops(functools.partial(torso, agent), params, roi),
         "decision_flops": flops(functools.partial(decision, agent), params, frame, focal_point, core_state, key),
         "params": sum(leaf.size for leaf in jax.tree.leaves(params)),

@@ -48,7 +48,7 @@ def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str,
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": list(command),
         "directory": os.getcwd(),
-        "commit": _commit(),
+        "commit": commit(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in _PACKAGES},
         "host": socket.gethostname(),
@@ -67,7 +67,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """The commit of the checkout this package runs from, with "-dirty" after changes; None elsewhere."""
     package = Path(__file__).resolve().parents[1]
     # An installed package may lie inside the checkout of something else.
@@ -79,6 +79,14 @@ def _commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return result.stdout.strip() or None
+
+
+def last_commit(path: Path) -> str | None:
+    """The commit that the run in `path` was last started with; None of anything else."""
+    try:
+        return json.loads((path / RECORD).read_text(encoding="utf-8"))["starts"][-1]["commit"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
 
 
 def _cpu() -> str:

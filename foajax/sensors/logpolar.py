@@ -78,6 +78,11 @@ def ring_edges(sensor: LogPolarSensor) -> np.ndarray:
     return np.concatenate([[0.0], sensor.fovea * growth ** (np.arange(sensor.rings) / (sensor.rings - 1))])
 
 
+def shares(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(cell, pixel of the window, weight) of all that `warp` adds up, sorted by cell; cells and pixels are numbered."""
+    return _bilinear_weights(sensor) if sensor.sampling == "bilinear" else _area_weights(sensor)
+
+
 @functools.lru_cache
 def _tables(sensor: LogPolarSensor) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Pixel indices and weights, each [cells, k], for one run of rings after the other.
@@ -85,8 +90,7 @@ def _tables(sensor: LogPolarSensor) -> tuple[tuple[np.ndarray, np.ndarray], ...]
     Rows are padded to the same k with weight 0. Outer cells have more pixels: one k for all would
     triple the work, so rings are grouped by k, within a factor of 1.4.
     """
-    weigh = _bilinear_weights if sensor.sampling == "bilinear" else _area_weights
-    cell, pixel, weight = weigh(sensor)
+    cell, pixel, weight = shares(sensor)
     counts = np.bincount(cell, minlength=sensor.rings * sensor.wedges)
     slot = np.arange(len(cell)) - np.repeat(np.cumsum(counts) - counts, counts)
     index = np.zeros((len(counts), counts.max()), np.int32)

@@ -148,7 +148,7 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     package = tmp_path / "checkout" / "foajax"
     package.mkdir(parents=True)
     monkeypatch.setattr(provenance, "__file__", str(package / "runs" / "provenance.py"))
-    assert provenance._commit() is None
+    assert provenance.commit() is None
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
     (package / "file").write_text("one")
@@ -159,12 +159,12 @@ def test_the_commit_is_that_of_the_package_or_none(tmp_path, monkeypatch):
     ):
         subprocess.run(["git", *words], cwd=package.parent, check=True)
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=package, capture_output=True, text=True).stdout.strip()
-    assert provenance._commit() == head
+    assert provenance.commit() == head
     (package / "file").write_text("two")
-    assert provenance._commit() == f"{head}-dirty"
+    assert provenance.commit() == f"{head}-dirty"
     installed = package / "venv" / "foajax"
     monkeypatch.setattr(provenance, "__file__", str(installed / "runs" / "provenance.py"))
-    assert provenance._commit() is None
+    assert provenance.commit() is None
 
 
 # What may change between two starts

@@ -1,0 +1,90 @@
+"""An exported agent plays whole games through ale-py, without JAX and foajax: `python robot_plays_atari.py robot/`.
+
+A loop of one's own around `Agent.decide`. It needs `numpy onnxruntime ale-py`. The protocol is that of training: each
+action is held for four frames and the brighter pixels of the last two are seen; up to 30 no-ops and FIRE begin a game;
+FIRE begins each further life, with memory and gaze reset.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from ale_py import Action, ALEInterface, LoggerMode, roms
+
+FRAME_SKIP, NOOPS, MOST_STEPS = 4, 30, 27_000
+
+
+def play(agent, emulator: ALEInterface, actions: list[Action], random: np.random.Generator) -> tuple[float, int]:
+    """One whole game: its unclipped score and how many decisions it took."""
+    emulator.reset_game()
+    screen, reward = begin(emulator, actions, int(random.integers(NOOPS + 1)))
+    agent.reset()
+    score, steps, lives = reward, 0, emulator.lives()
+    reward = 0.0
+    while not emulator.game_over() and steps < MOST_STEPS:
+        natural, _ = agent.decide(screen, reward)
+        screen, reward = step(emulator, actions[natural])
+        score, steps = score + reward, steps + 1
+        if emulator.lives() < lives and not emulator.game_over():
+            screen, gained = begin(emulator, actions, 0)
+            agent.reset()
+            score, reward = score + gained, 0.0
+        lives = emulator.lives()
+    return score, steps
+
+
+def begin(emulator: ALEInterface, actions: list[Action], noops: int) -> tuple[np.ndarray, float]:
+    """No-ops, a frame each, then FIRE where the game has it: the first screen, and what was earned meanwhile."""
+    reward = float(sum(emulator.act(Action.NOOP) for _ in range(noops)))
+    screen, gained = step(emulator, Action.FIRE if Action.FIRE in actions else Action.NOOP, frames=1)
+    return screen, reward + gained
+
+
+def step(emulator: ALEInterface, action: Action, frames: int = FRAME_SKIP) -> tuple[np.ndarray, float]:
+    """Holds an action for some frames: the brighter pixels of the last two, gray, uint8 [210, 160], and the reward."""
+    screens, reward = [], 0.0
+    for _ in range(frames):
+        reward += emulator.act(action)
+        screens.append(emulator.getScreenGrayscale())
+        if emulator.game_over():
+            break
+    return np.maximum.reduce(screens[-2:]), reward
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", help="what foajax export wrote")
+    parser.add_argument("--games", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--greedy", action="store_true")
+    options = parser.parse_args()
+    sys.path.insert(0, options.folder)
+    from agent import Agent
+
+    ALEInterface.setLoggerMode(LoggerMode.Error)
+    agent = Agent(options.folder, seed=options.seed, greedy=options.greedy)
+    actions = [Action[name.upper()] for name in agent.facts["actions"]]
+    random, scores, begun = np.random.default_rng(options.seed), [], time.perf_counter()
+    for game in range(options.games):
+        emulator = ALEInterface()
+        emulator.setFloat("repeat_action_probability", 0.0)
+        emulator.setInt("random_seed", options.seed + game)
+        emulator.loadROM(Path(roms.get_rom_path(agent.facts["game"])))
+        score, steps = play(agent, emulator, actions, random)
+        scores.append(score)
+        print(f"game {game + 1}: {score:g} in {steps} decisions", flush=True)
+    error = np.std(scores, ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else float("nan")
+    seconds = round(time.perf_counter() - begun, 1)
+    print(
+        json.dumps({"games": len(scores), "mean": float(np.mean(scores)), "stderr": float(error), "seconds": seconds})
+    )
+
+
+if __name__ == "__main__":
+    main()

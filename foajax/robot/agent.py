@@ -1,0 +1,296 @@
+"""A trained agent that sees, decides and moves its gaze. It needs NumPy and ONNX Runtime, nothing else.
+
+    agent = Agent("robot/")
+    natural, vision = agent.decide(frame)  # once per frame: memory and focal point go on from call to call
+    agent.reset()  # where an episode begins
+
+`python agent.py --check` replays the decisions recorded in golden.npz and compares.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+try:
+    import cv2  # adds up a large camera image in a third of NumPy's time; nothing else needs it
+except ImportError:
+    cv2 = None  # type: ignore[assignment]
+
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue in gray (ITU-R BT.601)
+DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)])  # (y, x)
+SCREEN = (210, 160)  # an Atari screen's rows and columns
+
+
+class AgentError(Exception):
+    """What the caller can mend, in one line."""
+
+
+class Agent:
+    """One agent looking through one camera.
+
+    Args:
+      folder: what `foajax export` wrote.
+      greedy: take the likeliest actions; else draw them, as in training.
+      seed: of what is drawn.
+      source: 'screen' for Atari screens, uint8 [210, 160]; 'camera' for uint8 [h, w] or [h, w, 3] of any size; by
+        default what the agent was trained with.
+      order: of a colour image's channels, 'rgb' or 'bgr' (OpenCV's).
+    """
+
+    def __init__(
+        self, folder: str | Path = ".", *, greedy: bool = False, seed: int = 0, source: str = "", order: str = "rgb"
+    ) -> None:
+        self.folder = Path(folder)
+        self.facts = read_facts(self.folder)
+        self.greedy, self.source = greedy, source or self.facts["source"]
+        if self.source not in ("screen", "camera") or (self.source == "screen" and self.facts["crop_top"] is None):
+            raise AgentError(f"source={self.source}: accepted is camera, or screen where the agent plays Atari")
+        self.order = order
+        self._random = np.random.default_rng(seed)
+        self._limits = np.array(self.facts["gaze"]["limits"])  # smallest and largest focal point
+        with np.load(self.folder / "arrays.npz") as arrays:
+            self._sensor = Sensor(self.facts, dict(arrays))
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads, options.log_severity_level = 1, 1, 3
+        network = str(self.folder / "policy.onnx")
+        self._session = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
+        self._outputs = {output.name: output.shape for output in self._session.get_outputs()}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begins an episode: empty memory, the gaze at its start, no last action."""
+        states = {name[5:]: shape[1:] for name, shape in self._outputs.items() if name.startswith("next_")}
+        self.core = {name: np.zeros((1, *shape), np.float32) for name, shape in states.items()}
+        self.age = 0  # decisions since the episode began
+        self.last_actions: tuple[int, int] | None = None  # change it where the robot did something else
+        start, low, high = self.facts["gaze"]["start"], *self._limits
+        self.focal_point = self._random.integers(low, high + 1) if start == "random" else np.array(start)
+        self.looked_at = self.focal_point  # the last focal point, where focal_point is the next: (y, x), frame pixels
+        self.outputs: dict[str, np.ndarray] = {}  # of the network at the last decision
+
+    def decide(self, frame: np.ndarray, reward: float = 0.0) -> tuple[int, int]:
+        """The natural and the visual action upon a frame; `reward` is what the last action earned.
+
+        Raises:
+          AgentError: the frame is not as the agent takes it. The agent's state is as before then.
+        """
+        images = self._sensor.look(self.frame(frame), self.focal_point)
+        feed = {f"image_{i}": image[None, None] for i, image in enumerate(images)} | self._side(reward)
+        outputs = dict(zip(self._outputs, self._session.run([*self._outputs], feed | self.core), strict=True))
+        natural, vision, gaze = self._choose(outputs["natural_logits"]), 0, self.facts["gaze"]
+        if gaze["mode"] in ("learned", "random"):
+            drawn = gaze["mode"] == "random"
+            vision = int(self._random.integers(gaze["actions"])) if drawn else self._choose(outputs["vision_logits"])
+        self.core = {name: outputs[f"next_{name}"] for name in self.core}
+        self.outputs, self.looked_at, self.last_actions = outputs, self.focal_point, (natural, vision)
+        self.age += 1
+        self.focal_point = self._move(vision)
+        return natural, vision
+
+    def frame(self, image: np.ndarray) -> np.ndarray:
+        """A screen or a camera's image as the frame that the sensor looks at: float32 [H, W] in [0, 1]."""
+        shape, kind = getattr(image, "shape", ()), str(getattr(image, "dtype", type(image).__name__))
+        is_camera = self.source == "camera"
+        fits = len(shape) in (2, 3) and shape[2:] in ((), (3,)) and 0 not in shape if is_camera else shape == SCREEN
+        if kind != "uint8" or not fits:
+            accepted = "[h, w] or [h, w, 3]" if is_camera else f"{list(SCREEN)}, gray"
+            raise AgentError(f"frame={kind} {list(shape)}: accepted is uint8 {accepted}")
+        if not is_camera:
+            return halve(image, self.facts["crop_top"])
+        if shape != tuple(self.facts["frame_shape"]):
+            if self.order not in ("rgb", "bgr"):
+                raise AgentError(f"order={self.order}: accepted is rgb or bgr")
+            image = shrink(image, self.facts["frame_shape"], LUMA if self.order == "rgb" else LUMA[::-1])
+        return image.astype(np.float32) * np.float32(1 / 255)
+
+    def _side(self, reward: float) -> dict[str, np.ndarray]:
+        """What the network is told beside the images."""
+        told, parts = self.facts["side"], []
+        low, high = self._limits
+        if told["focal_point"] == "frame":
+            parts.append(self.focal_point / np.array(self.facts["frame_shape"]) * 2.0 - 1.0)
+        elif told["focal_point"] == "reach":
+            parts.append((2 * self.focal_point - (low + high)) / np.maximum(high - low, 1))
+        for place, count in enumerate(told["last_actions"] or ()):
+            last = -1 if self.last_actions is None else self.last_actions[place]
+            parts.append(np.arange(count) == last)
+        if not np.isfinite(reward):
+            raise AgentError(f"reward={reward}: accepted is a finite number")
+        if told["last_reward"]:
+            parts.append([0.0 if self.last_actions is None else np.sign(reward) if told["clip_reward"] else reward])
+        return {"side": np.concatenate(parts).astype(np.float32)[None]} if parts else {}
+
+    def _choose(self, logits: np.ndarray) -> int:
+        # The largest of logits with Gumbel noise is a draw from their softmax.
+        return int(np.argmax(logits[0] if self.greedy else logits[0] + self._random.gumbel(size=logits.shape[1])))
+
+    def _move(self, vision: int) -> np.ndarray:
+        gaze, path = self.facts["gaze"], self.facts["gaze"]["path"]
+        to = self.focal_point + gaze["step"] * DIRECTIONS[vision]
+        return np.array(path[self.age % len(path)]) if gaze["mode"] == "scripted" else np.clip(to, *self._limits)
+
+
+class Sensor:
+    """What is seen of a frame around a focal point: float32 images [h, w]. What lies outside or is hidden is 0."""
+
+    def __init__(self, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        self._sensor, self._shape, self._window = facts["sensor"], facts["frame_shape"], np.array(facts["window"])
+        self._by_frame, self._arrays = facts["normalisation"] == "frame", arrays
+
+    def look(self, frame: np.ndarray, focal_point: np.ndarray) -> list[np.ndarray]:
+        """The images at a focal point (y, x). The frame is normalised where it is looked at, and only there."""
+        if self._by_frame:
+            frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3))
+        arrays, sensor = self._arrays, self._sensor
+        top, left = focal_point - self._window // 2
+        window = self._cut(frame, top, left) - self._cut(arrays["mean"], top, left)
+        if sensor["kind"] == "logpolar":
+            values = np.add.reduceat(window.ravel()[arrays["pixel"]] * arrays["weight"], arrays["first"])
+            return [values.reshape(sensor["rings"], sensor["wedges"])]
+        # A weight divides by the number of pixels and by the deviation; it is 0 where a finer ring lies.
+        images = [self._sums(window, *ring) * arrays[f"weight_{i}"] for i, ring in enumerate(sensor["rings"])]
+        if sensor["peripheral"]:
+            cells = (self._cells(frame) - arrays["mean_cells"]) * arrays["cell_weight"]
+            edges = (arrays["row_edges"], top), (arrays["column_edges"], left)
+            rows, columns = ((e[:-1] >= at) & (e[1:] <= at + n) for (e, at), n in zip(edges, self._window, strict=True))
+            images.append(cells * ~(rows[:, None] & columns))
+        return [self._canvas(images, top, left)] if sensor["layout"] == "canvas" else images
+
+    def _cut(self, image: np.ndarray, top: int, left: int) -> np.ndarray:
+        """The focal area with its top-left pixel at (top, left)."""
+        (height, width), (rows, columns) = self._window, self._shape
+        if 0 <= top <= rows - height and 0 <= left <= columns - width:
+            return image[top : top + height, left : left + width]
+        y, x = max(top, 0), max(left, 0)
+        part = image[y : top + height, x : left + width]
+        area = np.zeros((height, width), np.float32)
+        area[y - top : y - top + part.shape[0], x - left : x - left + part.shape[1]] = part
+        return area
+
+    def _sums(self, window: np.ndarray, height: int, width: int, factor: int) -> np.ndarray:
+        """The sum of each block of a ring, or its first pixel; the last blocks may be smaller."""
+        top, left = self._window // 2 - (height // 2, width // 2)
+        area = window[top : top + height, left : left + width]
+        if factor == 1 or self._sensor["pooling"] == "stride":
+            return area[::factor, ::factor]
+        return _block_sums(_block_sums(area, factor).T, factor).T
+
+    def _cells(self, image: np.ndarray) -> np.ndarray:
+        """The peripheral grid, the whole frame in coarse cells: the sum of each, or its first pixel."""
+        rows, columns = self._arrays["row_edges"][:-1], self._arrays["column_edges"][:-1]
+        if self._sensor["pooling"] == "stride":
+            return image[rows][:, columns]
+        return np.add.reduceat(np.add.reduceat(image, rows, 0), columns, 1)
+
+    def _canvas(self, images: list[np.ndarray], top: int, left: int) -> np.ndarray:
+        """Every value painted over the pixels that it stands for, on an image of the frame's size."""
+        values = np.concatenate([*(image.ravel() for image in images), np.zeros(1, np.float32)])
+        canvas = values.take(self._arrays["paint_background"])
+        y, x, area = max(top, 0), max(left, 0), values.take(self._arrays["paint_window"])
+        room = canvas[y : top + len(area), x : left + area.shape[1]]
+        room[:] = area[y - top : y - top + room.shape[0], x - left : x - left + room.shape[1]]
+        return canvas
+
+
+def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray) -> np.ndarray:
+    """A camera's image [h, w] or [h, w, 3] as a gray frame, uint8 [H, W]: area means, rounded half up.
+
+    An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
+    each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
+    """
+    axes = list(zip(image.shape, frame_shape, strict=False))
+    if image.ndim == 3 and any(size < 2 * wanted for size, wanted in axes):
+        image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
+    if any(size < wanted for size, wanted in axes):
+        rows, columns = (_weights(*axis) for axis in axes)
+        means = rows @ image.astype(np.float32) @ columns.T
+    else:
+        means = _add_up(np.ascontiguousarray(image), [_spans(*axis) for axis in axes], luma)
+    return np.floor(means + np.float32(0.5)).astype(np.uint8)
+
+
+def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray) -> np.ndarray:
+    # The first step reads every byte, and so it adds up before colours are mixed. No matrix products here: their
+    # threads would wait for each other.
+    flat, (first, shared, part, scale) = image.reshape(len(image), -1), spans[0]
+    sums: Any = np.empty((len(first) - 1 + len(shared), flat.shape[1]), np.float32)
+    for i, begin, end in zip(range(len(sums)), first[:-1], first[1:], strict=False):
+        rows = flat[begin:end]
+        if cv2:
+            cv2.reduce(rows, 0, cv2.REDUCE_SUM, sums[i : i + 1], cv2.CV_32F)
+        else:
+            sums[i] = np.add.reduce(rows, 0, np.uint32)
+    sums[len(first) - 1 :] = flat[first[shared]]
+    if image.ndim == 3:
+        sums = sums.reshape(len(sums), -1, 3)
+        sums = cv2.transform(sums, luma[None]) if cv2 else sum(sums[..., i] * luma[i] for i in range(3))
+    strips = _share(sums[: len(first) - 1], sums[len(first) - 1 :], shared, part, scale)
+    first, shared, part, scale = spans[1]
+    return _share(np.add.reduceat(strips, first[:-1], 1).T, strips.T[first[shared]], shared, part, scale).T
+
+
+def halve(screen: np.ndarray, crop_top: int) -> np.ndarray:
+    """Mean of each 2x2 block of the screen rows crop_top .. crop_top + 159: float32 [80, 80] in [0, 1]."""
+    kept = screen[crop_top : crop_top + 160].astype(np.uint16)
+    rows = kept[0::2] + kept[1::2]
+    return (rows[:, 0::2] + rows[:, 1::2]).astype(np.float32) * np.float32(1 / 1020)
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """What agent.json says, once the files that it decides with are those that were exported."""
+    try:
+        facts = json.loads((folder / "agent.json").read_text(encoding="utf-8"))
+        if facts["format"] != 1:
+            raise AgentError(f"{folder}: has format {facts['format']}; accepted by this agent.py is 1")
+        for name in ("policy.onnx", "arrays.npz"):
+            if hashlib.sha256((folder / name).read_bytes()).hexdigest() != facts["files"][name]:
+                raise AgentError(f"{folder / name}: is not the file that was exported; export again")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise AgentError(f"{folder}: accepted is a folder that foajax export wrote ({error!r})") from None
+    return facts
+
+
+@functools.cache
+def _weights(source: int, target: int) -> np.ndarray:
+    """[target, source]: the share of each source pixel in each target pixel, along one axis."""
+    edges, pixel = np.arange(target + 1)[:, None] * source / target, np.arange(source)[None]
+    covered = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
+    return (np.maximum(covered, 0) * target / source).astype(np.float32)
+
+
+@functools.cache
+def _spans(source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """The pixel in which each target pixel begins; those that begin inside one, and the part of it before them."""
+    first, rest = np.divmod(np.arange(target + 1) * source, target)
+    shared = np.flatnonzero(rest)
+    return first, shared, (rest[shared] / target).astype(np.float32)[:, None], target / source
+
+
+def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.ndarray, scale: float) -> np.ndarray:
+    """Means of sums over whole pixels, once pixels that two of them share are divided between these."""
+    sums[shared] -= part * pixels
+    sums[shared - 1] += part * pixels
+    return sums * np.float32(scale)
+
+
+def _block_sums(x: np.ndarray, factor: int) -> np.ndarray:
+    sums = x[::factor].copy()
+    for i in range(1, factor):
+        part = x[i::factor]
+        sums[: len(part)] += part
+    return sums
+
+
+if __name__ == "__main__":
+    from check import main
+
+    sys.exit(main(sys.argv[1:]))

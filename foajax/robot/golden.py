@@ -1,0 +1,56 @@
+"""What the JAX agent does, recorded for the exported one to be compared with."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+
+from foajax.envs.gymnasium import gray_frames
+from foajax.runs.agents import TrainedAgent
+from foajax.viewing import games
+
+STEPS, GAMES = 200, 2  # a second game begins half way, with memory and gaze reset
+_BLOCK = 5  # pixels of one colour in the images: noise would fill the folder
+
+
+def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
+    """The first `STEPS` / 2 greedy decisions of each of two games, one after the other; each array [STEPS, ...].
+
+    `frame` is what the environment shows, uint8, and `is_first` where memory and gaze begin anew. Further arrays
+    `image_<i>` are colour images, uint8 [h, w, 3], and `gray_<i>` the frames that training would make of them.
+
+    Raises:
+      ConfigError: the game cannot be played here.
+    """
+    environment = games.environment(stored, num_envs=GAMES, seed=seed)
+    act = jax.jit(functools.partial(stored.agent.act, greedy=True))
+    state, key = stored.agent.initial_state(GAMES), jax.random.key(seed)
+    rows: dict[str, list[np.ndarray]] = {}
+    timestep, _ = environment.reset()
+    for step in range(STEPS // GAMES):
+        now = jax.random.fold_in(key, step)
+        output, network, state = act(stored.params, stored.statistics, state, timestep, now)
+        row = {name: getattr(timestep, name) for name in ("frame", "reward", "is_first")}
+        row |= {name: getattr(output, name) for name in ("focal_point", "natural_action", "vision_action")}
+        row |= {name: getattr(network, name) for name in ("natural_logits", "vision_logits")}
+        for name, value in row.items():
+            if value is not None:
+                rows.setdefault(name, []).append(np.array(value))
+        environment.send(np.asarray(output.natural_action))
+        timestep, _ = environment.recv()
+    environment.close()
+    golden = {name: np.concatenate(np.stack(values, axis=1)) for name, values in rows.items()}
+    return golden | _images(stored.agent.config.env.frame_shape, seed)
+
+
+def _images(frame_shape: tuple[int, int], seed: int) -> dict[str, np.ndarray]:
+    """A camera's images, one a little and one much larger than the frame, in no whole proportion to it."""
+    random, arrays = np.random.default_rng(seed), {}
+    for i, (height, width) in enumerate(((9, 3), (frame_shape[0] + 7, 2 * frame_shape[1] + 5))):
+        size = frame_shape[0] + height, frame_shape[1] + width
+        blocks = random.integers(0, 256, (*(-(-length // _BLOCK) for length in size), 3), np.uint8)
+        image = blocks.repeat(_BLOCK, 0).repeat(_BLOCK, 1)[: size[0], : size[1]]
+        arrays[f"image_{i}"], arrays[f"gray_{i}"] = image, gray_frames(image[None], frame_shape)[0]
+    return arrays
