@@ -13,7 +13,7 @@ SCREENS = np.random.default_rng(0).integers(0, 256, (8, 80, 80), np.uint8)
 
 
 class Faulty(gymnasium.Env):
-    """Six steps an episode; a fault in a step comes in the thirteenth."""
+    """Six steps an episode; a fault in a step comes in the twenty-first."""
 
     observation_space = spaces.Box(0, 255, (80, 80), np.uint8)
     action_space = spaces.Discrete(2)
@@ -29,7 +29,7 @@ class Faulty(gymnasium.Env):
 
     def step(self, action):
         self.steps += 1
-        if self.steps > 12:
+        if self.steps > 20:
             self._fail_in("step")
         return SCREENS[self.steps % 8], float(action), self.steps % 6 == 0, False, {}
 

@@ -35,6 +35,7 @@ WORDS = [
     "env.num_envs=32",
     "learner.num_minibatches=4",
     "learner.rollout_length=4",
+    "learner.schedule=constant",  # so that a run may be made longer
     "train.log_every=1e-6",
 ]
 TWENTY_UPDATES = 640  # env_steps

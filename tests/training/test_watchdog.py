@@ -139,7 +139,7 @@ def test_a_failing_environment_costs_nothing_that_was_learned(tmp_path, fault, s
     run = tmp_path / "run"
     code, _, err = faulty(run, fault)
     assert code == FAULT
-    # Twelve steps are two rollouts of five.
+    # Twenty steps, and three that begin episodes, are two rollouts of five that observe and two that learn.
     line = f"game=gymnasium:faulty:Faulty-v0: {said}; saved at 80 env_steps, the same command goes on from there"
     assert err == f"foajax: error: {line}; details in {run}/fault.txt\n"
     assert newest(run) == 80
