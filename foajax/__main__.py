@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import runpy
 import sys
 
@@ -34,6 +35,7 @@ def main() -> None:
         print(f"foajax: error: {name}: accepted is one of {', '.join(COMMANDS)}{hint}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [sys.argv[0], *words]
+    sys.path.insert(0, os.getcwd())  # as `python -m` has it: parts of one's own may be here
     runpy.run_module(f"foajax.{name}", run_name="__main__", alter_sys=True)
 
 
