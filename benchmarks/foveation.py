@@ -75,7 +75,7 @@ def per_sensor() -> dict[str, float]:
     frames, points = batch(32)
     for name, sensor in sensors().items():
         centred = np.full_like(points, 40)
-        inside = points if isinstance(sensor, RingSensor) and sensor.window[0] <= 70 else centred
+        inside = points if sensor.window is not None and sensor.window[0] <= 70 else centred
         (results[name],) = median_times([sensing(sensor, frames, inside)])
         print(f"  {name:24} {results[name]:8.0f} us")
     return results

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import sys
 
@@ -35,6 +36,7 @@ def main() -> None:
         print(f"foajax: error: {refuse(name, accepted=COMMANDS, near=name)}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [sys.argv[0], *words]
+    sys.path.insert(0, os.getcwd())  # as `python -m` has it: parts of one's own may be here
     runpy.run_module(f"foajax.{name}", run_name="__main__", alter_sys=True)
 
 

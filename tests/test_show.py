@@ -9,10 +9,11 @@ from PIL import Image
 from foajax import cli, show
 from foajax.config.compose import compose
 from foajax.config.schema import LogPolarSensor, RingSensor
+from foajax.sensors.registry import make_sensor
 from foajax.viewing import sheet
 
-CANVAS = RingSensor(rings=((20, 20, 2), (40, 40, 4)))
-PACKED = RingSensor(rings=((20, 20, 2), (40, 40, 4)), peripheral=(5, 5), layout="packed")
+CANVAS = make_sensor(RingSensor(rings=((20, 20, 2), (40, 40, 4))))
+PACKED = make_sensor(RingSensor(rings=((20, 20, 2), (40, 40, 4)), peripheral=(5, 5), layout="packed"))
 FRAME = np.random.default_rng(0).random((80, 80)).astype(np.float32)
 
 
@@ -43,7 +44,9 @@ def test_the_rings_are_drawn_where_the_areas_end():
 
 
 def test_a_retina_is_drawn_as_a_circle():
-    image = np.asarray(sheet._marked(np.zeros((80, 80), np.float32), LogPolarSensor(radius=20.0), (40, 40)))
+    image = np.asarray(
+        sheet._marked(np.zeros((80, 80), np.float32), make_sensor(LogPolarSensor(radius=20.0)), (40, 40))
+    )
     rows, columns = np.nonzero(image[..., 0])
     distance = np.hypot(rows + 0.5 - 120, columns + 0.5 - 120)
     assert ((abs(distance - 59) < 2.5) | (distance < 8)).all()  # the circle, and the cross in its middle
@@ -56,7 +59,7 @@ def test_a_packed_layout_shows_its_images():
     assert captions == ["image 0: 10 x 10", "image 1: 10 x 10", "image 2: 5 x 5"]
     mean = FRAME[30:32, 30:32].mean() / FRAME.max()
     assert (levels(panels[2])[:24, :24] == round(255 * mean)).all()
-    assert len(sheet._panels(FRAME, LogPolarSensor(rings=8, wedges=8), (40, 40))) == 3
+    assert len(sheet._panels(FRAME, make_sensor(LogPolarSensor(rings=8, wedges=8)), (40, 40))) == 3
 
 
 def test_a_black_frame_is_drawn():
@@ -73,10 +76,10 @@ def test_a_row_for_each_focal_point():
 
 
 def test_the_heading_counts_values():
-    decreasing = RingSensor(rings=((30, 30, 1), (50, 50, 2), (70, 70, 4)))
+    decreasing = make_sensor(RingSensor(rings=((30, 30, 1), (50, 50, 2), (70, 70, 4))))
     expected = "1,450 values (1,480 shown), 23% of the frame"
     assert sheet._heading(FRAME, decreasing, "decreasing") == ("decreasing", expected)
-    nonfoa = RingSensor(rings=((80, 80, 1),))
+    nonfoa = make_sensor(RingSensor(rings=((80, 80, 1),)))
     assert sheet._heading(FRAME, nonfoa, "nonfoa") == ("nonfoa", "6,400 values, 100% of the frame")
 
 
@@ -102,7 +105,7 @@ def test_the_command(still, tmp_path, capsys):
 def test_a_sensor_of_ones_own(still, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        show, "draw", lambda frame, sensor, points, name: drawn.append(sensor) or Image.new("RGB", (9, 9))
+        show, "draw", lambda frame, sensor, points, name: drawn.append(sensor.config) or Image.new("RGB", (9, 9))
     )
     for words in (["sensor=rings", "sensor.rings=[[40,40,1]]"], ["sensor=constant70", "sensor.pooling=stride"]):
         assert cli.run(show.show, [*words, f"out={tmp_path / 'own.png'}"]) == 0
