@@ -13,7 +13,9 @@ from foajax.learning.optimizer import make_optimizer
 
 UPDATES = 200
 SHAPES = {"dense": {"kernel": (5, 3), "bias": (3,)}, "scale": ()}
-PLAIN = LearnerConfig(learning_rate=0.01, full_rate_inputs=None, warmup_updates=0, amsgrad=True, max_grad_norm=None)
+PLAIN = LearnerConfig(
+    learning_rate=0.01, full_rate_inputs=None, warmup_updates=0, schedule="constant", amsgrad=True, max_grad_norm=None
+)
 
 
 def is_shape(x):
