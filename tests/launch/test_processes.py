@@ -238,7 +238,9 @@ def test_an_address_without_a_port_is_refused(monkeypatch, address):
     monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", address)
     monkeypatch.setenv("JAX_NUM_PROCESSES", "2")
     monkeypatch.setenv("JAX_PROCESS_ID", "0")
-    with pytest.raises(ConfigError, match=f"^JAX_COORDINATOR_ADDRESS={address}: accepted is host:port of process 0$"):
+    with pytest.raises(
+        ConfigError, match=f"^JAX_COORDINATOR_ADDRESS={address or repr('')}: accepted is host:port of process 0$"
+    ):
         distributed.where(compose([]))
 
 
@@ -320,7 +322,7 @@ def test_more_devices_than_there_are_is_one_line(tmp_path):
         (["distributed.coordinator=a", "distributed.processes=2", "distributed.process=0"], "host:port"),
         (["distributed.coordinator=a:1", "distributed.processes=2", "distributed.process=2"], "from 0 to 1"),
         (["distributed.coordinator=a:1", "distributed.processes=0", "distributed.process=0"], "an integer >= 1"),
-        (["distributed.timeout=0"], "seconds > 0"),
+        (["distributed.timeout=0"], "a number > 0"),
     ],
 )
 def test_what_cannot_be_a_job_is_refused(words, said):

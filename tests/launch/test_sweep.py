@@ -187,7 +187,7 @@ def train(directory, *words):
 
 def test_two_experiments_and_two_seeds(tmp_path):
     (tmp_path / "sweep").mkdir()
-    tiny = [*TINY, "gaze=learned"]
+    tiny = [*TINY, "gaze=learned", "learner.schedule=constant"]
     words = ["experiment=nonfoa,constant50_sub2_packed", "seed=1,2", *tiny, "train.env_steps=2000"]
     single = ["experiment=nonfoa", "seed=1", *tiny, "train.env_steps=1000"]
     assert train(tmp_path / "sweep", *single)[0] == 0
