@@ -16,7 +16,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from foajax import __version__
 from foajax.config.parse import ConfigError, refuse, to_mapping
 from foajax.config.schema import Config, LogPolarSensor, OwnSensor, RingSensor
 from foajax.envs.atari import is_atari
@@ -198,7 +197,7 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
     if isinstance(sensor, LogPolarSensor):
         cell, pixel, share = logpolar.shares(sensor)
         first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
-        return found | {"pixel": pixel, "weight": (share / std).astype(np.float32), "first": first}
+        return found | {"pixel": pixel.astype(int), "weight": (share / std).astype(np.float32), "first": first}
     assert isinstance(sensor, RingSensor)
     packed = agent.sensor.packed
     # A frame of ones shows which blocks a finer ring hides.
@@ -233,7 +232,7 @@ def _provenance(stored: TrainedAgent, source: str, command: Sequence[str]) -> di
         "score": load_score(source),
         "trained_with": provenance.last_commit(Path(source)),
         "exported_with": provenance.commit(),
-        "foajax": __version__,
+        "foajax": provenance.version("foajax"),
         "command": list(command),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
     }

@@ -50,7 +50,7 @@ def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str,
         "directory": os.getcwd(),
         "commit": commit(),
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: version(name) for name in _PACKAGES},
         "host": socket.gethostname(),
         "process": os.getpid(),
         "system": platform.platform(),
@@ -60,7 +60,8 @@ def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str,
     }
 
 
-def _version(package: str) -> str | None:
+def version(package: str) -> str | None:
+    """Of an installed package; None where it is not there."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
