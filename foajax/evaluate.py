@@ -3,6 +3,7 @@
 The games are those of the agent's training, with seeds of their own. `env.<key>=value` changes them, for another
 protocol: `env.sticky_actions=0.25`, `env.episodic_life=false` (the agent has to start each life itself),
 `env.max_episode_steps=4500`. A game that reaches the last of these, 27,000 decisions by default, is cut and counted.
+`search.<key>=value` changes the scenes of visual search: `search.set_sizes=[1,4,8,16]`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from rich.text import Text
 
 from foajax import cli
 from foajax.config.parse import Section, replace
+from foajax.config.schema import SearchConfig
+from foajax.envs.measures import summarise
 from foajax.runs.agents import load_agent
 from foajax.viewing.games import play
 
@@ -53,11 +56,16 @@ class Options(Section):
 
 def evaluate(arguments: Sequence[str]) -> None:
     """The command."""
-    protocol = [word for word in arguments if word.startswith("env.")]
+    protocol = [word for word in arguments if word.startswith(("env.", "search."))]
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
     stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
-    env = cli.override(stored.agent.config.env, protocol, "env", _PROTOCOL)
-    config = replace(stored.agent.config, env=env)
+    config = stored.agent.config
+    env, scenes = ([word for word in protocol if word.startswith(part)] for part in ("env.", "search."))
+    config = replace(
+        config,
+        env=cli.override(config.env, env, "env", _PROTOCOL),
+        search=cli.override(config.search, scenes, "search", list(SearchConfig.model_fields)),
+    )
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("games", total=options.episodes)
         games = play(
@@ -80,6 +88,7 @@ def evaluate(arguments: Sequence[str]) -> None:
         "mean": float(games.returns.mean()),
         "stderr": standard_error(games.returns),
         "cut": games.cut,
+        "measures": summarise(games.facts),
         "returns": games.returns.tolist(),
         "lengths": games.lengths.tolist(),
     }
@@ -111,6 +120,8 @@ def _print(result: dict) -> None:
     )
     console = Console(width=120)
     console.print(table)
+    if result["measures"]:
+        console.print(", ".join(f"{name} {value:.3g}" for name, value in result["measures"].items()))
     if result["cut"]:
         console.print(f"{result['cut']} of them were cut at env.max_episode_steps")
 

@@ -47,6 +47,9 @@ class ActorState(NamedTuple):
     focal_point: Int[Array, "B 2"]  # (y, x) in frame pixels, used to sense the next frame
     age: Int[Array, "B"]  # steps since the episode began, for a scripted gaze
     last_actions: Int[Array, "B 2"] | None = None  # natural, visual; None where the network is not told
+    # Prices of the last two saccades, to be taken from the next reward and from the one after it (`Agent.act`);
+    # None where saccades are free.
+    owed: Float[Array, "B 2"] | None = None
 
 
 class NetworkOutput(NamedTuple):
@@ -67,7 +70,7 @@ class ActorOutput(NamedTuple):
     vision_action: Int[Array, "B"]  # 0 where gaze is not learned
     natural_log_prob: Float[Array, "B"]  # of the action, when it was chosen
     vision_log_prob: Float[Array, "B"]
-    reward: Float[Array, "B"]  # of the time step acted on
+    reward: Float[Array, "B"]  # of the time step acted on, less the price of a saccade
     is_first: Bool[Array, "B"]
     is_terminal: Bool[Array, "B"]
     last_actions: Int[Array, "B 2"] | None  # natural and visual action of the step before, as the network was told

@@ -35,6 +35,7 @@ Ring = Annotated[tuple[int, int, int], _says("[height, width, factor] with 1 <= 
 Grid = Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], _says("[rows, columns] >= 1")]
 Side = Annotated[int, Field(ge=8, le=10_000)]
 Shape = Annotated[tuple[Side, Side], _says("[height, width], each from 8 to 10000")]
+Letters = Annotated[int, Field(ge=1, le=1000)]
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Row = Annotated[int, Field(ge=0, le=50), _says("a screen row from 0 to 50 (160 rows are kept of 210)")]
 Name = Annotated[str, Field(pattern=r"\S"), _says("a name")]
@@ -68,6 +69,11 @@ class RingSensor(Section):
         """Height and width of the focal area in frame pixels."""
         return self.rings[-1][:2]
 
+    @property
+    def finest(self) -> tuple[int, int]:
+        """Height and width of the inner ring, which is seen best."""
+        return self.rings[0][:2]
+
 
 class LogPolarSensor(Section):
     """A log-polar retina: rings x wedges around the focal point, radii growing geometrically."""
@@ -92,6 +98,12 @@ class LogPolarSensor(Section):
         side = 2 * math.ceil(self.radius)
         return side, side
 
+    @property
+    def finest(self) -> tuple[int, int]:
+        """Height and width of the square around the innermost disc, which is seen best."""
+        side = 2 * math.ceil(self.fovea)
+        return side, side
+
 
 class OwnSensor(Section):
     """A sensor from elsewhere; see `foajax.sensors.base.Sensor`. It is made, and checked, where it is first used."""
@@ -100,6 +112,7 @@ class OwnSensor(Section):
     size_key: ClassVar[str] = "sensor.kwargs"
     may_overhang: ClassVar[bool] = True
     window: ClassVar[None] = None  # not known before it is made
+    finest: ClassVar[None] = None
     kind: str = Field(description="Its class, package.module:Class.")
     kwargs: Mapping[str, Any] = Field({}, description="Arguments of its constructor.")
 
@@ -120,15 +133,47 @@ class GazeConfig(Section):
     mode: Literal["none", "learned", "frozen", "random", "scripted"] = Field(
         "learned", description="What moves the focal point; none for a sensor that shows the whole frame."
     )
-    actions: Literal[5, 9] = Field(5, description="Stay, up, down, left, right; 9 adds the diagonals.")
-    step: int = Field(4, ge=1, le=10_000, description="Frame pixels that a visual action moves.")
-    bounds: Literal["window", "point"] = Field("window", description="What has to stay inside the frame.")
+    moves: Literal["steps", "absolute"] = Field(
+        "steps", description="What a visual action is: a step, or a cell of a grid to look at."
+    )
+    actions: Literal[5, 9] = Field(
+        5, description="Directions of steps: stay, up, down, left, right; 9 adds the diagonals."
+    )
+    step: int | tuple[int, ...] = Field(
+        4, description="Frame pixels of a step; several sizes, rising, give an action each per direction."
+    )
+    grid: Grid = Field((5, 5), description="Cells that an absolute move chooses from.")
+    cost: float = Field(0.0, ge=0, description="Price of a saccade, taken from the reward that is learned from.")
+    cost_per: Literal["pixel", "saccade"] = Field(
+        "pixel", description="What is counted: frame pixels moved, or saccades of any length."
+    )
+    bounds: Literal["window", "fovea", "point"] = Field(
+        "window", description="What has to stay inside the frame: the whole area, its finest part, or the point alone."
+    )
     start: Literal["centre", "random"] | Point = Field("centre", description="Start of an episode, moved in bounds.")
     path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved in bounds.")
 
     def check(self) -> None:
+        sizes = self.sizes
+        rising = all(a < b for a, b in zip(sizes, sizes[1:], strict=False))
+        if not sizes or not rising or sizes[0] < 1 or sizes[-1] > 10_000:
+            raise refuse("step", self.step, "an integer from 1 to 10000, or a rising list of them")
+        if self.grid[0] * self.grid[1] > 10_000:
+            raise refuse("grid", self.grid, "[rows, columns] >= 1, at most 10000 cells")
         if self.mode == "scripted" and not self.path:
             raise refuse("path", self.path, "at least one [y, x] where gaze.mode=scripted")
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The step sizes, frame pixels, smallest first."""
+        return (self.step,) if isinstance(self.step, int) else self.step
+
+    @property
+    def num_actions(self) -> int:
+        """How many visual actions there are."""
+        if self.moves == "absolute":
+            return self.grid[0] * self.grid[1]
+        return 1 + (self.actions - 1) * len(self.sizes)
 
     @property
     def learned(self) -> bool:
@@ -162,11 +207,41 @@ class EnvConfig(Section):
             raise refuse("crop_top", self.crop_top, "a mapping with the key 'default'")
 
 
+class SearchConfig(Section):
+    """The scenes of game=search and game=detect."""
+
+    prefix: ClassVar[str] = "search."
+    target: Literal["letter", "feature", "conjunction", "cued"] = Field(
+        "letter", description="What tells the target: its letter, its brightness, both, or a cue shown first."
+    )
+    set_sizes: tuple[Letters, ...] = Field((8,), min_length=1, description="Letters in a scene, drawn from these.")
+    targets: tuple[Letters, ...] = Field(
+        (1,), min_length=1, description="Targets among them, drawn from these; all point the same way."
+    )
+    absent: bool = Field(False, description="Half of the scenes have no target, and one more answer says so.")
+    classes: Literal[2, 4] = Field(2, description="Ways that the target may point, and answers.")
+    max_fixations: int = Field(
+        30, ge=1, le=10_000, description="Decisions after which an episode ends as with a wrong answer."
+    )
+    price: float = Field(0.01, ge=0, lt=1, description="Price of a decision, in units of reward.")
+    contrast: tuple[float, float] = Field(
+        (0.6, 1.0), description="Contrast of letters on their plates, drawn between these."
+    )
+    noise: float = Field(0.0, ge=0, le=64, description="Standard deviation of noise, gray levels.")
+    clutter: int = Field(0, ge=0, le=1000, description="Bars between the letters.")
+
+    def check(self) -> None:
+        if max(self.targets) > max(self.set_sizes):
+            raise refuse("targets", self.targets, "a list of integers >= 1, none above search.set_sizes")
+        if not 0 < self.contrast[0] <= self.contrast[1] <= 1:
+            raise refuse("contrast", self.contrast, "[least, most] in (0, 1]")
+
+
 class NetworkConfig(Section):
     """The network's parts and their sizes."""
 
     prefix: ClassVar[str] = "network."
-    torso: str = Field("nature", description="The convolutions: nature, a3c, impala, or package.module:Class.")
+    torso: str = Field("nature", description="The convolutions: nature, a3c, small, impala, or package.module:Class.")
     widths: tuple[Width, ...] | None = Field(
         None, min_length=1, description="Channels of the torso's layers; null for its own."
     )
@@ -194,7 +269,7 @@ class NetworkConfig(Section):
     )
 
     def check(self) -> None:
-        for key, ours in (("torso", ("nature", "a3c", "impala")), ("core", ("lstm", "gru", "mingru", "none"))):
+        for key, ours in (("torso", ("nature", "a3c", "small", "impala")), ("core", ("lstm", "gru", "mingru", "none"))):
             if (name := getattr(self, key)) not in ours and ":" not in name:
                 raise refuse(key, name, (*ours, "package.module:Class"))
 
@@ -296,13 +371,15 @@ class Config(Section):
         Discriminator(_kind),
     ]
     game: Name = Field(
-        "breakout", description="An Atari game, seek, probe:<name>, gymnasium:<id>, or package.module:factory."
+        "breakout",
+        description="An Atari game, seek, search, detect, probe:<name>, gymnasium:<id>, or package.module:factory.",
     )
     seed: int = Field(0, ge=0, le=2**31 - 10_001, description="Seed of environments, parameters and actions.")
     run: str | None = Field(None, description="The run's directory; null for runs/<game>-<name>-s<seed>.")
     profile: bool = Field(False, description="Trace some updates into <run>/profile in place of training.")
     gaze: GazeConfig = GazeConfig()
     env: EnvConfig = EnvConfig()
+    search: SearchConfig = SearchConfig()
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()
     train: TrainConfig = TrainConfig()
@@ -323,6 +400,8 @@ class Config(Section):
         grid = getattr(self.sensor, "peripheral", None) or (1, 1)
         if grid[0] > height or grid[1] > width:
             raise refuse("sensor.peripheral", grid, f"a grid no finer than {frame}")
+        if self.gaze.moves == "absolute" and (self.gaze.grid[0] > height or self.gaze.grid[1] > width):
+            raise refuse("gaze.grid", self.gaze.grid, f"a grid no finer than {frame}")
         for y, x in self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ()):
             if not (0 <= y < height and 0 <= x < width):
                 raise refuse("gaze.start or gaze.path", (y, x), f"[y, x] inside {frame}")

@@ -14,7 +14,7 @@ an `Environment` of `num_envs` copies, of which copy i draws from `seed + i`. It
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -56,3 +56,21 @@ def first_step(screen: np.ndarray) -> tuple[TimeStep, Outcome]:
     """What `Environment.reset` gives, with these screens."""
     zeros, false = np.zeros(len(screen), np.float32), np.zeros(len(screen), bool)
     return TimeStep(screen, zeros, is_first=~false, is_terminal=false), Outcome(score=zeros, is_over=false)
+
+
+def reads_gaze(environment: Environment) -> bool:
+    """Whether its rules depend on where the agent looks."""
+    return getattr(environment, "reads_gaze", False)
+
+
+def send(environment: Environment, action: np.ndarray, focal_point: Any) -> None:
+    """`environment.send`; one that reads the gaze is told where the screens were sensed, int32 [B, 2], too."""
+    if reads_gaze(environment):
+        cast(Any, environment).send(action, np.asarray(focal_point))
+    else:
+        environment.send(action)
+
+
+def facts(environment: Environment) -> dict[str, np.ndarray] | None:
+    """What the environment tells about its episodes as they stand, each [B, ...]; None where it tells nothing."""
+    return cast(Any, environment).facts() if hasattr(environment, "facts") else None

@@ -10,6 +10,7 @@ import numpy as np
 from foajax.config.parse import refuse
 from foajax.config.parts import make_part
 from foajax.config.schema import Config
+from foajax.envs import search
 from foajax.envs.ale import AleEnvironment
 from foajax.envs.atari import atari_name, is_atari, is_own
 from foajax.envs.base import Environment
@@ -20,7 +21,7 @@ from foajax.envs.tasks import JaxEnvironment
 
 
 def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> Environment:
-    """The environment that plays `config.game`: an Atari game, `seek`, `probe:<name>`, `gymnasium:<id>` or
+    """The environment that plays `config.game`: an Atari game, one of `OWN`, `gymnasium:<id>` or
     `package.module:factory`.
 
     Args:
@@ -39,7 +40,7 @@ def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> E
             raise refuse("game", config.game, "what makes all of a foajax.envs.base.Environment")
         return made
     if config.game in OWN:
-        return JaxEnvironment(OWN[config.game](config.env.frame_shape), num_envs=num_envs, seed=seed)
+        return JaxEnvironment(OWN[config.game](config), num_envs=num_envs, seed=seed)
     if config.game.startswith("gymnasium:"):
         return GymnasiumEnvironment(config, num_envs=num_envs, seed=seed, render=render)
     engine = EnvPoolEnvironment if config.env.engine == "envpool" else AleEnvironment
@@ -54,6 +55,8 @@ def action_names(config: Config) -> tuple[str, ...] | None:
     """
     if config.game == "seek":
         return ("leave", "take")
+    if config.game in ("search", "detect"):
+        return search.action_names(config)
     if not is_atari(config):
         return None
     from ale_py import ALEInterface, LoggerMode, roms  # here, like EnvPool

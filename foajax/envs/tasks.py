@@ -27,8 +27,11 @@ class Task(NamedTuple):
     frame_shape: tuple[int, int]  # (H, W)
     start: Callable[[Key[Array, ""]], TaskState]  # the first state of an episode
     # What an action leads to: the next state, the reward in [-1, 1], and whether nothing follows.
-    advance: Callable[[TaskState, Int[Array, ""]], tuple[TaskState, Float[Array, ""], Bool[Array, ""]]]
+    # One that reads the gaze is told, too, at which focal point (y, x) the screen was sensed that was decided upon.
+    advance: Callable[..., tuple[TaskState, Float[Array, ""], Bool[Array, ""]]]
     draw: Callable[[TaskState], UInt8[Array, "H W"]]  # the screen, gray, 0..255
+    reads_gaze: bool = False
+    facts: Callable[[TaskState], dict[str, Array]] | None = None  # about the episode, for measures
 
 
 class EnvState(NamedTuple):
@@ -64,19 +67,41 @@ def reset(task: Task, key: Key[Array, ""]) -> tuple[EnvState, TimeStep]:
     return state, observe(task, state)
 
 
-def step(task: Task, state: EnvState, action: Int[Array, ""]) -> tuple[EnvState, TimeStep]:
+def step(
+    task: Task, state: EnvState, action: Int[Array, ""], focal_point: Int[Array, "2"] | None = None
+) -> tuple[EnvState, TimeStep]:
     """Takes `action` or, after a terminal, ignores it and begins the next episode with reward 0."""
     fresh, _ = reset(task, state.key)
-    inner, reward, is_terminal = task.advance(state.task, action)
-    taken = EnvState(
+    taken = _take(task, state, action, focal_point)
+    after = jax.tree.map(lambda a, b: jnp.where(state.is_terminal, a, b), fresh, taken)
+    return after, observe(task, after)
+
+
+def step_all(
+    task: Task, state: EnvState, action: Int[Array, "B"], focal_point: Int[Array, "B 2"]
+) -> tuple[EnvState, TimeStep]:
+    """`step` of B environments: the same results, but only those that begin an episode pay for its start."""
+    over = state.is_terminal
+    order = jnp.argsort(~over, stable=True)  # those that are over come first
+
+    def begin(i: Int[Array, ""], after: EnvState) -> EnvState:
+        fresh, _ = reset(task, after.key[order[i]])
+        return jax.tree.map(lambda every, one: every.at[order[i]].set(one), after, fresh)
+
+    taken = jax.vmap(partial(_take, task))(state, action, focal_point)
+    after = jax.lax.fori_loop(0, jnp.sum(over), begin, taken)
+    return after, jax.vmap(partial(observe, task))(after)
+
+
+def _take(task: Task, state: EnvState, action: Int[Array, ""], focal_point: Int[Array, "2"] | None) -> EnvState:
+    inner, reward, is_terminal = task.advance(state.task, action, *([focal_point] if task.reads_gaze else []))
+    return EnvState(
         task=inner,
         key=state.key,
         reward=reward.astype(jnp.float32),
         is_first=jnp.bool_(False),
         is_terminal=is_terminal,
     )
-    after = jax.tree.map(lambda a, b: jnp.where(state.is_terminal, a, b), fresh, taken)
-    return after, observe(task, after)
 
 
 class JaxEnvironment:
@@ -91,24 +116,33 @@ class JaxEnvironment:
     def __init__(self, task: Task, *, num_envs: int, seed: int) -> None:
         self.num_envs = num_envs
         self.num_actions = task.num_actions
+        self.reads_gaze = task.reads_gaze
+        self._centre = np.tile(np.array(task.frame_shape, np.int32) // 2, (num_envs, 1))
         self._keys = jax.vmap(jax.random.key)(seed + np.arange(num_envs))
         self._reset = jax.jit(jax.vmap(partial(reset, task)))
-        self._step = jax.jit(jax.vmap(partial(step, task)))
+        self._step = jax.jit(partial(step_all, task))
         self._observe = jax.jit(jax.vmap(partial(observe, task)))
+        self._facts = None if task.facts is None else jax.jit(jax.vmap(task.facts))
 
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins every environment again from the seed."""
         self._state, self._timestep = self._reset(self._keys)
         return self.recv()
 
-    def send(self, action: np.ndarray) -> None:
-        """Starts a step; `action` is int32 [B]."""
-        self._state, self._timestep = self._step(self._state, jnp.asarray(action, jnp.int32))
+    def send(self, action: np.ndarray, focal_point: np.ndarray | None = None) -> None:
+        """Starts a step; `action` is int32 [B]. `focal_point`, int32 [B, 2], is where the last screens were sensed,
+        for a task that reads the gaze: (y, x) in pixels; None for the centre."""
+        point = self._centre if focal_point is None else focal_point
+        self._state, self._timestep = self._step(self._state, jnp.asarray(action, jnp.int32), jnp.asarray(point))
 
     def recv(self) -> tuple[TimeStep, Outcome]:
         """The step that `send` started, once it is there."""
         timestep = TimeStep(*map(np.asarray, self._timestep))
         return timestep, Outcome(score=timestep.reward, is_over=timestep.is_terminal)
+
+    def facts(self) -> dict[str, np.ndarray] | None:
+        """What the task tells about the episodes as they stand, each [B, ...]; None for one that tells nothing."""
+        return None if self._facts is None else jax.tree.map(np.asarray, self._facts(self._state.task))
 
     def get_state(self) -> EnvState:
         """Every environment's state, each field [B, ...]; between `recv` and `send`."""

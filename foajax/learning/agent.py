@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, Num, PRNGKeyArray, UInt8
 
 from foajax.config.parse import refuse
 from foajax.config.schema import Config, check_window
@@ -74,6 +74,7 @@ class Agent:
             focal_point=jnp.zeros((batch, 2), jnp.int32),
             age=jnp.zeros((batch,), jnp.int32),
             last_actions=jnp.zeros((batch, 2), jnp.int32) if self.config.network.last_actions else None,
+            owed=jnp.zeros((batch, 2)) if self.config.gaze.cost else None,
         )
 
     def act(
@@ -90,20 +91,19 @@ class Agent:
 
         The visual action chosen here moves the focal point that the *next* frame is sensed at. `key` is one, or one
         an actor: then what an actor samples does not depend on who the others are.
+
+        Saccades are paid one step late. The move chosen at t serves the decision at t+1, so its price is taken from
+        the reward R_{t+2} of that decision. That is the reward that credits the move (`returns.vision_stream`): both
+        heads see the price in their returns, the vision head right after the move. Before an end nothing is paid.
         """
         actors = state.age.shape[0]
         keys = jax.random.split(key, actors) if key.ndim == 0 else key
         start_key, natural_key, vision_key = jax.vmap(lambda k: jax.random.split(k, 3), out_axes=1)(keys)
-        frame = self.frame(timestep.frame)
-        if self._by_pixel:
-            frame_mean, frame_std = jax.vmap(lambda f: frames.pixel_statistics(f, statistics))(frame)
-        else:
-            frame_mean, frame_std = jax.vmap(frames.frame_statistics)(frame)
-        frame = self.normalise(frame, statistics)
         focal_point, age = self.look(start_key, state, timestep)
-        roi = self.sense(frame, focal_point)
+        roi, frame_mean, frame_std = self.see(timestep.frame, focal_point, statistics)
         images = [image[None] for image in roi]
-        reward, is_first = jnp.asarray(timestep.reward), jnp.asarray(timestep.is_first)
+        is_first = jnp.asarray(timestep.is_first)
+        reward, owed = _pay(jnp.asarray(timestep.reward), state.owed, is_first)
         side = self.side(focal_point, state.last_actions, reward, is_first)
         output, core_state = self.forward(params, images, side[None], is_first[None], state.core_state)
         output = jax.tree.map(lambda x: x[0], output)
@@ -123,11 +123,13 @@ class Agent:
             frames=(jnp.mean(frame_mean, axis=0, keepdims=True), jnp.mean(frame_std, keepdims=True)),
         )
         told = state.last_actions is not None
+        moved = self.move(focal_point, vision_action, age + 1)
         state = ActorState(
             core_state=core_state,
-            focal_point=self.move(focal_point, vision_action, age + 1),
+            focal_point=moved,
             age=age + 1,
             last_actions=jnp.stack([natural_action, vision_action], axis=-1) if told else None,
+            owed=None if owed is None else jnp.stack([owed, self.price(focal_point, moved)], axis=-1),
         )
         return actor_output, output, state
 
@@ -141,13 +143,37 @@ class Agent:
         """The network over T steps; `inputs` are those of `networks.Network`."""
         return cast(tuple[NetworkOutput, Carry], self.network.apply(params, *inputs))
 
+    def see(
+        self, screen: UInt8[HostArray, "B ..."], focal_point: Int[Array, "B 2"], statistics: FrameStatistics
+    ) -> tuple[tuple[Array, ...], Float[Array, "B ..."], Float[Array, "B"]]:
+        """The sensor's images of normalised frames, and each frame's part in the running statistics.
+
+        Without normalisation and crop only what the sensor looks at is read: then the cost of a decision does not
+        grow with the frame. (A peripheral grid of means looks at all of it.) There are no statistics then: zeros.
+        """
+        if self.config.network.normalization == "none" and self.crop_top is None:
+            self.check(screen)
+            none = jnp.zeros(screen.shape[0])
+            roi = self.sense(jnp.asarray(screen), focal_point)
+            return tuple(image * jnp.float32(1 / 255) for image in roi), none, none
+        frame = self.frame(screen)
+        if self._by_pixel:
+            mean, std = jax.vmap(lambda f: frames.pixel_statistics(f, statistics))(frame)
+        else:
+            mean, std = jax.vmap(frames.frame_statistics)(frame)
+        return self.sense(self.normalise(frame, statistics), focal_point), mean, std
+
     def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W"]:
         """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
+        self.check(screen)
+        return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
+
+    def check(self, screen: UInt8[HostArray, "B ..."]) -> None:
+        """`ValueError` for screens that are not as the agent was trained with."""
         shape = self.config.env.frame_shape if self.crop_top is None else SCREEN_SHAPE
         if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
             accepted = f"uint8 [B, {shape[0]}, {shape[1]}], gray"
             raise refuse("frame", f"{screen.dtype} {list(screen.shape)}", accepted)
-        return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
 
     def normalise(self, frame: Float[Array, "B H W"], statistics: FrameStatistics) -> Float[Array, "B H W"]:
         """Frames with about zero mean and unit deviation, by the configured rule."""
@@ -166,7 +192,13 @@ class Agent:
         """Where the next frame is sensed."""
         if self.config.gaze.mode == "scripted":
             return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age)
+        if self.config.gaze.mode in ("none", "frozen"):
+            return focal_point
         return jax.vmap(lambda p, a: gaze.move(p, a, **self._gaze))(focal_point, vision_action)
+
+    def price(self, before: Int[Array, "B 2"], after: Int[Array, "B 2"]) -> Float[Array, "B"]:
+        """What the saccades from `before` to `after` cost, in units of reward."""
+        return jax.vmap(functools.partial(gaze.price, gaze=self.config.gaze))(before, after)
 
     def choose_vision(self, key: Key[Array, "B"], output: NetworkOutput, greedy: bool) -> tuple[Array, Array]:
         """Visual actions and their log-probabilities: learned, uniformly random, or 0 (stay)."""
@@ -175,13 +207,14 @@ class Agent:
             action = _choose(key, output.vision_logits, greedy)
             return action, log_prob(output.vision_logits, action)
         if self.config.gaze.mode == "random":
-            draw = jax.vmap(lambda k: jax.random.randint(k, (), 0, self.config.gaze.actions))
+            draw = jax.vmap(lambda k: jax.random.randint(k, (), 0, self.config.gaze.num_actions))
             return draw(key), jnp.zeros(batch)
         return jnp.zeros(batch, jnp.int32), jnp.zeros(batch)
 
-    def sense(self, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
+    def sense(self, frame: Num[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
         """The sensor's images of each frame, [B, h, w, 1]."""
-        look = functools.partial(sense, sensor=self.sensor, bounds=self.config.gaze.bounds)
+        bounds = "window" if self.config.gaze.bounds == "window" else "point"
+        look = functools.partial(sense, sensor=self.sensor, bounds=bounds)
         return jax.vmap(look)(frame, focal_point)
 
     def side(
@@ -228,7 +261,18 @@ class Agent:
     @property
     def _gaze(self) -> dict:
         config = self.config
-        return {"gaze": config.gaze, "window": self.sensor.window, "frame_shape": config.env.frame_shape}
+        window = gaze.bounded(config.gaze, self.sensor)
+        return {"gaze": config.gaze, "window": window, "frame_shape": config.env.frame_shape}
+
+
+def _pay(
+    reward: Float[Array, "B"], owed: Float[Array, "B 2"] | None, is_first: Bool[Array, "B"]
+) -> tuple[Float[Array, "B"], Float[Array, "B"] | None]:
+    """The reward less what is due now, and what is due next; what an episode leaves unpaid is forgiven."""
+    if owed is None:
+        return reward, None
+    owed = jnp.where(is_first[:, None], 0.0, owed)
+    return reward - owed[:, 0], owed[:, 1]
 
 
 def _choose(key: Key[Array, "B"], logits: Float[Array, "B A"], greedy: bool) -> Int[Array, "B"]:

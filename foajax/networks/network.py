@@ -13,7 +13,7 @@ from foajax.networks.cores import LSTM, Carry, make_core
 from foajax.networks.torsos import RELU_GAIN, make_torso
 from foajax.types import NetworkOutput, Params
 
-_SMALLEST_IMAGE = 8  # below it (a 5x5 periphery) the values go straight to the next layer
+_SMALLEST_IMAGE = {"small": 12}  # below it, or 8 (a 5x5 periphery), the values go straight to the next layer
 
 
 class Network(nn.Module):
@@ -60,7 +60,7 @@ class Network(nn.Module):
         """What the torso makes of the sensor's images, concatenated; then the dense layer if there is one."""
         parts = [
             make_torso(self.config, name=f"torso_{i}")(x)
-            if min(x.shape[1:3]) >= _SMALLEST_IMAGE
+            if min(x.shape[1:3]) >= _SMALLEST_IMAGE.get(self.config.torso, 8)
             else x.reshape(x.shape[0], -1)
             for i, x in enumerate(images)
         ]
@@ -84,7 +84,7 @@ def make_network(config: Config, num_natural_actions: int) -> Network:
     return Network(
         config=config.network,
         num_natural_actions=num_natural_actions,
-        num_vision_actions=config.gaze.actions if config.gaze.learned else 0,
+        num_vision_actions=config.gaze.num_actions if config.gaze.learned else 0,
     )
 
 

@@ -101,7 +101,22 @@ class ImpalaTorso(nn.Module):
         return nn.relu(x).reshape(x.shape[0], -1)
 
 
-TORSOS = {"nature": NatureTorso, "a3c": A3CTorso, "impala": ImpalaTorso}  # by `network.torso`
+class SmallTorso(nn.Module):
+    """Two convolutions for images of some hundred values: 16 4x4/2, 32 3x3/2, padded with zeros where strides do not
+    fit. A seventh of the nature torso's work on 16x16."""
+
+    widths: Sequence[int] = (16, 32)
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "N H W C"]) -> Float[Array, "N F"]:
+        for features, kernel in zip(self.widths, (4, 3), strict=True):
+            bottom, right = (-(size - kernel) % 2 for size in x.shape[1:3])
+            x = jnp.pad(x, ((0, 0), (0, bottom), (0, right), (0, 0)))
+            x = nn.relu(convolution(features, (kernel, kernel), 2)(x))
+        return x.reshape(x.shape[0], -1)
+
+
+TORSOS = {"nature": NatureTorso, "a3c": A3CTorso, "small": SmallTorso, "impala": ImpalaTorso}  # by `network.torso`
 
 
 def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
@@ -119,7 +134,7 @@ def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
     made = make_part("network.torso", config.torso, TORSOS, **arguments)
     if not isinstance(made, nn.Module):
         raise refuse("network.torso", config.torso, "a Flax module")
-    if isinstance(made, NatureTorso | A3CTorso) and len(made.widths) != len(type(made).widths):
+    if isinstance(made, NatureTorso | A3CTorso | SmallTorso) and len(made.widths) != len(type(made).widths):
         accepted = f"{len(type(made).widths)} numbers for network.torso={config.torso}"
         raise refuse("network.widths", list(made.widths), accepted)
     return made

@@ -145,7 +145,7 @@ def facts(stored: TrainedAgent) -> dict[str, Any]:
         "game": config.game,
         "experiment": config.name,
         "actions": list(names),
-        "visual_actions": list(gaze.NAMES[: config.gaze.actions]),
+        "visual_actions": list(gaze.names(config.gaze)),
         "steps_per_second": steps_per_second(config),
         "source": "camera" if agent.crop_top is None else "screen",
         "crop_top": agent.crop_top,

@@ -72,6 +72,11 @@ class Sensor(Protocol):
         return (self.window,)
 
     @property
+    def finest(self) -> Shape:
+        """Height and width of the part that is seen best, frame pixels."""
+        return self.areas[0]
+
+    @property
     def is_round(self) -> bool:
         """Whether they are ellipses."""
         return False

@@ -35,6 +35,11 @@ class LogPolar(Sensor):
     def __init__(self, config: LogPolarSensor) -> None:
         self.config, self.window = config, config.window
 
+    @property
+    def finest(self) -> Shape:
+        """The square around the innermost disc."""
+        return self.config.finest
+
     def sense(self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str) -> tuple[Array, ...]:
         """The cells around the focal point."""
         return look(frame, focal_point, bounds, size=self.window, pool=self._pool)

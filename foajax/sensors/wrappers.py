@@ -1,6 +1,6 @@
 """The sensors for other libraries: Gymnasium environments whose pixels are looked at through a gaze.
 
-An action is `{"natural": the environment's own, "vision": 0..4 or 0..8}`, a visual action as in
+An action is `{"natural": the environment's own, "vision": 0 .. V-1}`, a visual action as in
 `foajax.sensors.gaze`. It moves the focal point before the frame that the step leads to is sensed, as in
 `foajax.learning.agent`; where an episode starts, the focal point is at the gaze's start instead.
 
@@ -193,14 +193,14 @@ class _Eye:
 
     def action_space(self, natural: gymnasium.Space) -> gymnasium.Space:
         """Of one environment, whose own actions are `natural`."""
-        return spaces.Dict({"natural": natural, "vision": spaces.Discrete(self.gaze.actions)})
+        return spaces.Dict({"natural": natural, "vision": spaces.Discrete(self.gaze.num_actions)})
 
     def checked(self, vision_action: Any, shape: tuple[int, ...]) -> np.ndarray:
         """Visual actions as they go to the device; `ValueError` where they are none."""
         action = np.asarray(vision_action)
         known = action.shape == shape and np.issubdtype(action.dtype, np.integer)
-        if not known or (action < 0).any() or (action >= self.gaze.actions).any():
-            accepted = f"integers {list(shape)} from 0 to {self.gaze.actions - 1}"
+        if not known or (action < 0).any() or (action >= self.gaze.num_actions).any():
+            accepted = f"integers {list(shape)} from 0 to {self.gaze.num_actions - 1}"
             raise refuse("vision", action, accepted)
         return action.astype(np.int32)
 
@@ -232,10 +232,15 @@ class _Eye:
     ) -> tuple[dict[str, Float[Array, "..."]], Int[Array, "2"]]:
         """The observation and where it was sensed: moved from `focal_point`, or the start of an episode."""
         shape = (frame.shape[0], frame.shape[1])
-        where: dict[str, Any] = {"gaze": self.gaze, "window": self.sensor.window, "frame_shape": shape}
+        where: dict[str, Any] = {
+            "gaze": self.gaze,
+            "window": gazes.bounded(self.gaze, self.sensor),
+            "frame_shape": shape,
+        }
         start = gazes.start(jax.random.key(seed), **where)
         focal_point = jnp.where(is_first, start, gazes.move(focal_point, vision_action, **where))
-        images = sense(frame, focal_point, sensor=self.sensor, bounds=self.gaze.bounds)
+        bounds = "window" if self.gaze.bounds == "window" else "point"
+        images = sense(frame, focal_point, sensor=self.sensor, bounds=bounds)
         # A mean may round to just outside the range, and then would not be of the observation space.
         named = self.named([jnp.clip(image * self.scale, *self.range) for image in images])
         return {**named, "focal_point": gazes.to_unit(focal_point, shape)}, focal_point

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Array
 
 from foajax.config.schema import LearnerConfig
-from foajax.envs.base import Environment
+from foajax.envs.base import Environment, facts, reads_gaze, send
+from foajax.envs.measures import FactsTracker, pooled, summarise
 from foajax.learning.agent import Agent
 from foajax.learning.learner import Metrics
 from foajax.learning.programs import Programs, acting_keys, empty_rollout
@@ -61,6 +62,7 @@ class Collector:
         self._length = agent.config.learner.rollout_length
         batch = environments[0].num_envs
         self._keys = [acting_keys(seed, group, part * batch, batch) for group in range(len(environments))]
+        self._facts = [FactsTracker() for _ in environments]
         self.groups: list[Group] = []
         for environment in environments:
             timestep, _ = environment.reset()
@@ -86,7 +88,8 @@ class Collector:
                     self._receive(i, outcomes[i])
                 action, actor_state = self._act(i, acting, row, first_step + row)
                 self.groups[i] = self.groups[i]._replace(actor_state=actor_state)
-                environment.send(np.asarray(action))
+                points = self.groups[i].rollout.steps.focal_point
+                send(environment, np.asarray(action), points[row] if reads_gaze(environment) else None)
         for i in range(len(self._environments)):
             self._receive(i, outcomes[i])
             # The last row is only bootstrapped from: the same step is acted on again, with newer parameters,
@@ -102,6 +105,10 @@ class Collector:
                 action, actor_state = self._act(i, acting, row, first_step + row)
                 self.groups[i] = self.groups[i]._replace(actor_state=actor_state)
                 jax.block_until_ready(action)
+
+    def measures(self) -> dict[str, float]:
+        """What this process's last episodes tell beside their scores, by name; empty for most games."""
+        return summarise(pooled([tracker.table() for tracker in self._facts]))
 
     @property
     def resumable(self) -> bool:
@@ -137,3 +144,5 @@ class Collector:
         timestep, outcome = self._environments[i].recv()
         self.groups[i] = self.groups[i]._replace(timestep=timestep)
         outcomes.append(outcome)
+        if outcome.is_over.any() and (about := facts(self._environments[i])) is not None:
+            self._facts[i].add(about, outcome.is_over)

@@ -43,8 +43,15 @@ class Journal:
         """One line that begins with "warning:"."""
         self.say(f"warning: {text}")
 
-    def row(self, env_steps: int, metrics: Sequence[Metrics], tracker: EpisodeTracker, num_actions: int) -> None:
-        """A row of the updates' mean metrics and the last games' scores."""
+    def row(
+        self,
+        env_steps: int,
+        metrics: Sequence[Metrics],
+        tracker: EpisodeTracker,
+        measures: Mapping[str, float],
+        num_actions: int,
+    ) -> None:
+        """A row of the updates' mean metrics, the last games' scores and a task's own `measures`."""
         if self._logger is None:
             return
         rows = jax.device_get(metrics)
@@ -63,7 +70,7 @@ class Journal:
             "best_score": tracker.best_score,
         }
         skipped = {"skipped_updates": rows[-1]["skipped_updates"]}
-        self._logger.write({"env_steps": env_steps} | games | explained_variance(means) | skipped)
+        self._logger.write({"env_steps": env_steps} | games | dict(measures) | explained_variance(means) | skipped)
 
     def picture(self, rollout: Rollout, frame_shape: tuple[int, int]) -> None:
         """What the gaze saw, as images."""

@@ -208,7 +208,8 @@ class Run:
             raise
 
     def _log(self, metrics: list[Metrics]) -> None:
-        self._journal.row(self.progress.env_steps, metrics, self.progress.tracker, self._agent.num_actions)
+        measures = self._collector.measures()
+        self._journal.row(self.progress.env_steps, metrics, self.progress.tracker, measures, self._agent.num_actions)
 
     def _abandon(self, why: str, code: int) -> int:
         """The watchdog's last words, and the exit code: the main thread does not come back."""

@@ -10,8 +10,9 @@ import jax
 import numpy as np
 
 from foajax.config.parse import refuse
-from foajax.envs.base import Environment
+from foajax.envs.base import Environment, facts, send
 from foajax.envs.make import make
+from foajax.envs.measures import Facts, pooled
 from foajax.runs.agents import TrainedAgent
 
 _SEEDS = 2**31  # seeds to choose from
@@ -24,6 +25,7 @@ class Games(NamedTuple):
     returns: np.ndarray  # [episodes] unclipped
     lengths: np.ndarray  # [episodes] agent steps
     cut: int  # how many of them reached `env.max_episode_steps`
+    facts: Facts = {}  # about each, where the task tells any (`foajax.envs.measures`)
 
 
 def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool = False) -> Environment:
@@ -65,17 +67,21 @@ def play(
     key = jax.random.key(seed)
     returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
     finished: list[tuple[float, int, bool]] = []
+    tables: list[Facts] = []
     timestep, _ = watched.reset()
     step = 0
     while len(finished) < episodes:
         output, _, state = act(stored.params, stored.statistics, state, timestep, jax.random.fold_in(key, step))
-        watched.send(np.asarray(output.natural_action))
+        send(watched, np.asarray(output.natural_action), output.focal_point)
         timestep, outcome = watched.recv()
         returns += outcome.score
         lengths += 1 - timestep.is_first
         most = stored.agent.config.env.max_episode_steps
+        counted = outcome.is_over & (games < rounds)
+        if counted.any() and (about := facts(watched)) is not None:
+            tables.append({name: values[counted] for name, values in about.items()})
         for i in np.flatnonzero(outcome.is_over):
-            if games[i] < rounds[i]:
+            if counted[i]:
                 finished.append((float(returns[i]), int(lengths[i]), bool(lengths[i] >= most)))
             games[i] += 1
             returns[i], lengths[i] = 0, 0
@@ -84,4 +90,4 @@ def play(
             progress(len(finished))
     watched.close()
     scores, steps, cut = map(np.array, zip(*finished, strict=True))
-    return Games(returns=scores, lengths=steps, cut=int(cut.sum()))
+    return Games(returns=scores, lengths=steps, cut=int(cut.sum()), facts=pooled(tables))

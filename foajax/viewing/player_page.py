@@ -20,7 +20,7 @@ from PIL import Image
 
 from foajax.envs.make import steps_per_second
 from foajax.runs import durable
-from foajax.sensors.gaze import NAMES
+from foajax.sensors.gaze import names
 from foajax.sensors.reconstruct import tables
 from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
@@ -62,7 +62,7 @@ def encode(recording: Recording) -> dict[str, Any]:
         "round": sensor.is_round,
         "gaze": config.gaze.mode,
         "natural_names": recording.actions,
-        "vision_names": NAMES[: config.gaze.actions],
+        "vision_names": names(config.gaze),
         "images": [part.shape[1:] for part in recording.images],
         "count": values.shape[1],
         "white": max(int(values.max()), 1),
@@ -82,7 +82,7 @@ def _columns(recording: Recording) -> dict[str, tuple[str, str]]:
         "natural_probs": np.round(255 * recording.natural_probs).astype(np.uint8),
         "natural_value": recording.natural_value.astype(np.float32),
         "natural_action": recording.natural_action.astype(np.uint16),
-        "vision_action": recording.vision_action.astype(np.uint8),
+        "vision_action": recording.vision_action.astype(np.uint16),
         "score": recording.score.astype(np.float32),
         "is_first": recording.is_first.astype(np.uint8),
         "life_lost": recording.life_lost.astype(np.uint8),

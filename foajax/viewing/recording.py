@@ -15,7 +15,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from foajax.config.schema import Config
 from foajax.envs.atari import is_atari
-from foajax.envs.base import Environment
+from foajax.envs.base import Environment, send
+from foajax.envs.base import facts as facts_of
 from foajax.envs.make import action_names
 from foajax.learning.agent import Agent
 from foajax.runs.agents import TrainedAgent
@@ -74,6 +75,7 @@ class Recording(NamedTuple):
     score: Float[np.ndarray, "N"]  # of the game so far, unclipped
     lives: Int[np.ndarray, "N"] | None  # None where the game has none
     is_first: np.ndarray  # bool [N]: the learner's episode starts, with memory and gaze reset
+    facts: dict[str, np.ndarray] | None = None  # about the last episode, where the task tells any
 
     @property
     def life_lost(self) -> np.ndarray:
@@ -168,11 +170,13 @@ def _play(
             progress(len(rows), scores[-1])
         if outcome.is_over[0] or len(rows) == max_steps:
             break
-        environment.send(np.asarray(row.output.natural_action))
+        send(environment, np.asarray(row.output.natural_action), row.output.focal_point)
         timestep, outcome = environment.recv()
         if outcome.is_over[0] and timestep.is_first[0]:
             break  # the engine tells of the game's end only with the next one's first screen
+    about = facts_of(environment)
     return {
+        "facts": None if about is None else {name: values[0] for name, values in about.items()},
         "is_over": bool(outcome.is_over[0]),
         "screens": screens,
         "mean_frame": (total / len(rows)).astype(np.float32),

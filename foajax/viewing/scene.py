@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from foajax.sensors.gaze import NAMES
+from foajax.sensors.gaze import names
 from foajax.sensors.reconstruct import paint, tables
 from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
@@ -21,6 +21,7 @@ _TALL = 420  # of the screen
 _VIEW = 320  # of the sensor's view
 _HEADS = _TALL - 60  # of all their actions' rows
 _THINNEST = 9  # such a row
+_MOST_VISUAL = 25  # of the vision head's
 _CHART = (960 - 2 * _MARGIN, 84)
 _PAPER, _PANEL, _INK, _FAINT = "#12161b", "#1b2128", "#e8edf2", "#8b98a5"
 _LOST, _REWARD = "#ff6b6b", "#ffd166"
@@ -38,10 +39,10 @@ class Scene:
         self._scale = _fit(recording.screens.shape[:2], (_TALL, _VIEW))
         self._chart = _chart(recording)
         self._still = self._background()
-        visual = 0 if recording.vision_probs is None else recording.vision_probs.shape[1]
-        likeliest = np.argsort(-recording.natural_probs.mean(axis=0), kind="stable")
-        self._natural = np.sort(likeliest[: _HEADS // _THINNEST - visual])  # all of them, if there is room
-        self._row = min(24, _HEADS // (len(self._natural) + visual))
+        probs = recording.vision_probs
+        self._visual = np.arange(0) if probs is None else _likeliest(probs, _MOST_VISUAL)
+        self._natural = _likeliest(recording.natural_probs, _HEADS // _THINNEST - len(self._visual))
+        self._row = min(24, _HEADS // (len(self._natural) + len(self._visual)))
 
     def draw(self, step: int) -> Image.Image:
         """The picture of a step, RGB."""
@@ -107,16 +108,16 @@ class Scene:
 
     def _draw_heads(self, image: Image.Image, step: int) -> None:
         recording, some, top = self._recording, self._natural, _TOP - 16
-        names, probs = [recording.actions[i] for i in some], recording.natural_probs[step, some]
-        caption = "natural action"
-        if len(some) < len(recording.actions):
-            caption += f", the {len(some)} likeliest of {len(recording.actions)}"
+        called, probs = [recording.actions[i] for i in some], recording.natural_probs[step, some]
         chosen = some == recording.natural_action[step]
-        top = self._draw_bars(image, top, caption, NATURAL, names, probs, chosen)
+        caption = _caption("natural action", len(some), len(recording.actions))
+        top = self._draw_bars(image, top, caption, NATURAL, called, probs, chosen)
         if recording.vision_probs is not None:
-            probs = recording.vision_probs[step]
-            chosen = np.arange(len(probs)) == recording.vision_action[step]
-            self._draw_bars(image, top, "visual action", VISION, NAMES[: len(probs)], probs, chosen)
+            all_names, some = names(recording.config.gaze), self._visual
+            called, probs = [all_names[i] for i in some], recording.vision_probs[step, some]
+            chosen = some == recording.vision_action[step]
+            caption = _caption("visual action", len(some), len(all_names))
+            self._draw_bars(image, top, caption, VISION, called, probs, chosen)
         else:
             note = f"gaze is not learned: {recording.config.gaze.mode}"
             ImageDraw.Draw(image).text((self._heads_left, top), note, fill=_FAINT, font=_font(12))
@@ -190,6 +191,15 @@ def _chart(recording: Recording) -> Image.Image:
             y = height - 9 - (values - low) / max(high - low, 1e-6) * (height - 14)
             pen.line(list(zip(x.tolist(), y.tolist(), strict=True)), fill=colour)
     return image
+
+
+def _likeliest(probs: np.ndarray, most: int) -> np.ndarray:
+    """At most so many actions of the policies [N, n]: the likeliest over the game, in their own order."""
+    return np.sort(np.argsort(-probs.mean(axis=0), kind="stable")[:most])
+
+
+def _caption(what: str, shown: int, of: int) -> str:
+    return what if shown == of else f"{what}, the {shown} likeliest of {of}"
 
 
 def _fit(shape: tuple[int, ...], room: tuple[int, int]) -> float:

@@ -129,3 +129,50 @@ def test_errors_name_the_key():
         gaze.limits(gaze=GazeConfig(), window=(81, 20), frame_shape=FRAME)
     with pytest.raises(ConfigError, match=r"gaze\.path=\[\]: accepted is at least one"):
         gaze.scripted(jnp.int32(0), gaze=GazeConfig(), window=(1, 1), frame_shape=FRAME)
+
+
+def test_several_step_sizes_are_every_direction_in_every_size():
+    config, window = GazeConfig(step=(4, 16), actions=9, bounds="point"), (30, 20)
+    assert config.num_actions == 17 and len(gaze.names(config)) == 17
+    assert gaze.names(config)[:3] == ("stay", "up 4", "down 4") and gaze.names(config)[16] == "down right 16"
+    for action in range(17):
+        size, direction = (0, 0) if action == 0 else ((4, 16)[(action - 1) // 8], (action - 1) % 8 + 1)
+        wanted = [40 + size * MOVES[direction][0], 50 + size * MOVES[direction][1]]
+        moved = gaze.move(jnp.array([40, 50]), jnp.int32(action), gaze=config, window=window, frame_shape=FRAME)
+        assert moved.tolist() == wanted
+    assert gaze.names(GazeConfig()) == ("stay", "up", "down", "left", "right")
+
+
+@pytest.mark.parametrize("bounds", ["window", "point"])
+def test_an_absolute_move_looks_at_a_cells_centre_wherever_the_gaze_was(bounds):
+    config, window = GazeConfig(moves="absolute", grid=(3, 7), bounds=bounds), (30, 20)
+    assert config.num_actions == 21
+    assert gaze.names(config)[8] == "row 2, column 2"
+    limits = oracle_limits(bounds, window, FRAME)
+    for action in range(21):
+        row, column = action // 7, action % 7
+        wanted = [int((row + 0.5) * 80 / 3), int((column + 0.5) * 90 / 7)]
+        wanted = [min(max(p, low), high) for p, (low, high) in zip(wanted, limits, strict=True)]
+        for point in ([0, 0], [79, 3]):
+            moved = gaze.move(jnp.array(point), jnp.int32(action), gaze=config, window=window, frame_shape=FRAME)
+            assert moved.tolist() == wanted and moved.dtype == jnp.int32
+
+
+@pytest.mark.parametrize("cost_per", ["pixel", "saccade"])
+def test_a_price_is_by_the_distance_or_by_the_move(cost_per):
+    config = GazeConfig(cost=0.25, cost_per=cost_per)
+    for before, after in (((3, 4), (3, 4)), ((3, 4), (0, 0)), ((10, 10), (10, 11))):
+        distance = np.hypot(after[0] - before[0], after[1] - before[1])
+        wanted = 0.25 * (distance if cost_per == "pixel" else float(distance > 0))
+        price = jax.jit(functools.partial(gaze.price, gaze=config))(jnp.array(before), jnp.array(after))
+        np.testing.assert_allclose(price, wanted, rtol=1e-6)
+
+
+def test_keys_of_moves_name_what_is_accepted():
+    for wrong in ({"step": ()}, {"step": (16, 4)}, {"step": (0, 4)}):
+        with pytest.raises(ConfigError, match=r"gaze\.step=.*: accepted is an integer .* or a rising list"):
+            GazeConfig(**wrong)
+    with pytest.raises(ConfigError, match=r"gaze\.grid=\[0, 4\]: accepted is"):
+        GazeConfig(grid=(0, 4))
+    with pytest.raises(ConfigError, match=r"gaze\.cost=-1\.0: accepted is a number >= 0"):
+        GazeConfig(cost=-1.0)

@@ -1,0 +1,79 @@
+"""What episodes tell beside their score: facts of those that have ended, and the measures of visual search.
+
+A fact is an array with one value per episode: see `foajax.envs.search.facts`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Bool
+
+Facts = dict[str, np.ndarray]  # by name, each [n, ...] of n episodes
+
+
+class FactsTracker:
+    """The facts of the last episodes to end."""
+
+    def __init__(self, *, window: int = 2000) -> None:
+        self._window = window
+        self._rows: deque[Facts] = deque()
+        self._count = 0
+
+    def add(self, facts: Mapping[str, np.ndarray], is_over: Bool[np.ndarray, "B"]) -> None:
+        """Takes in the facts, each [B, ...], of those of B episodes that are over."""
+        if not is_over.any():
+            return
+        self._rows.append({name: np.asarray(values)[is_over] for name, values in facts.items()})
+        self._count += int(is_over.sum())
+        while self._count - len(next(iter(self._rows[0].values()))) >= self._window:
+            self._count -= len(next(iter(self._rows.popleft().values())))
+
+    def table(self) -> Facts:
+        """All of them, in the order in which the episodes ended; empty where none has."""
+        return pooled(self._rows)
+
+
+def pooled(tables: Iterable[Facts]) -> Facts:
+    """One table of several with the same facts."""
+    tables = [table for table in tables if table]
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]} if tables else {}
+
+
+def summarise(facts: Facts) -> dict[str, float]:
+    """The measures of visual search over some episodes, by name; empty for facts of other tasks.
+
+    Episodes with several targets, a help in learning, are left out where there are others.
+
+    - `accuracy`: share of right answers. `decisions`, `fixations`: how many an episode takes, until the answer.
+    - `on_target`: share of the fixations that land on the target, where there is one.
+    - `accuracy_8`, `fixations_8`, ...: the same at a set size.
+    - `slope_present`, `slope_absent`: fixations per item of the set, by least squares over the episodes that were
+      answered right; only where set sizes differ.
+    - `hit_rate`, `distance` (pixels), `overlap` (intersection over union): of the answers "here" (`game=detect`).
+    """
+    if "set_size" not in facts or not len(facts["set_size"]):
+        return {}
+    if (alone := facts["targets"] <= 1).any():
+        facts = {name: values[alone] for name, values in facts.items()}
+    right, present, sizes = facts["right"], facts["targets"] > 0, facts["set_size"]
+    row = {name: float(facts[key].mean()) for name, key in _MEANS.items()}
+    if present.any():
+        row["on_target"] = float(facts["on_target"][present].sum() / facts["fixations"][present].sum())
+    known = np.unique(sizes)
+    if len(known) > 1:
+        for size in known:
+            row |= {f"{name}_{size}": float(facts[key][sizes == size].mean()) for name, key in _MEANS.items()}
+        for name, part in (("slope_present", right & present), ("slope_absent", right & ~present)):
+            if len(np.unique(sizes[part])) > 1:
+                row[name] = float(np.polyfit(sizes[part], facts["fixations"][part], 1)[0])
+    pointed = facts["distance"] >= 0
+    if pointed.any():
+        row["hit_rate"] = float(right[pointed].mean())
+        row |= {name: float(facts[name][pointed].mean()) for name in ("distance", "overlap")}
+    return row
+
+
+_MEANS = {"accuracy": "right", "decisions": "decisions", "fixations": "fixations"}
