@@ -13,13 +13,14 @@ from typing import Any, cast
 import yaml
 
 from foajax.config.parse import Section, one_line, refuse
-from foajax.config.schema import RENAMED, Config, LogPolarSensor, RingSensor, from_mapping, renamed
+from foajax.config.schema import RENAMED, Config, LogPolarSensor, OwnSensor, RingSensor, from_mapping, renamed
 from foajax.config.shipped import experiments
 from foajax.config.table import defaults
 
 _KINDS: dict[str, type[Section]] = {
     "rings": RingSensor,
     "logpolar": LogPolarSensor,
+    "own": OwnSensor,
 }  # sensors of one's own, by themselves
 _WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave out
 
@@ -130,8 +131,9 @@ def _first_line(error: Exception) -> str:
 
 @functools.cache
 def _rings() -> tuple[str, ...]:
-    """The paper's sensors but for the whole frame."""
-    return tuple(sorted(file.stem for file in experiments().glob("sensor/*.yaml") if file.stem != _WHOLE))
+    """The paper's sensors but for the whole frame: the files that leave the layout open."""
+    files = (file for file in experiments().glob("sensor/*.yaml") if file.stem != _WHOLE)
+    return tuple(sorted(file.stem for file in files if "layout" not in yaml.safe_load(file.read_text())))
 
 
 def _packed() -> tuple[str, ...]:

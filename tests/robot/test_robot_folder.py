@@ -203,11 +203,14 @@ def test_what_is_not_installed_is_one_line(monkeypatch, capsys):
     assert "accepted is foajax[robot]" in capsys.readouterr().err
 
 
-def test_a_sensor_from_elsewhere_is_refused(make_stored):
+def test_a_sensor_from_elsewhere_is_refused(make_stored, tmp_path, monkeypatch):
+    text = "from foajax.sensors.base import Sensor\nclass Mine(Sensor):\n    window = (4, 4)\n"
+    (tmp_path / "my_sensors.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
     stored = make_stored("experiment=nonfoa")
-    config = replace(stored.agent.config, sensor={"kind": "mine.sensors:Sensor"})
+    config = replace(stored.agent.config, sensor={"kind": "my_sensors:Mine"})
     agent = dataclasses.replace(stored.agent, config=config)
-    with pytest.raises(ConfigError, match="sensor.kind=mine.sensors:Sensor: cannot be exported; accepted is one of"):
+    with pytest.raises(ConfigError, match="sensor.kind=my_sensors:Mine: cannot be exported; accepted is one of"):
         folder.facts(dataclasses.replace(stored, agent=agent))
 
 

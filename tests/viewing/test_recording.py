@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -137,7 +139,7 @@ def test_each_environment_plays_the_same_number_of_games(seeker, monkeypatch):
 
 
 def test_a_game_of_other_actions_is_refused(seeker):
-    other = seeker._replace(agent=Agent(seeker.agent.config, 3, None))
+    other = dataclasses.replace(seeker, agent=Agent(seeker.agent.config, 3, None))
     for watch in (lambda: next(record(other)), lambda: play(other, episodes=1, num_envs=1, seed=0, greedy=False)):
         with pytest.raises(ConfigError, match="^game=seek: has 2 actions; accepted are 3, as in training$"):
             watch()
@@ -148,7 +150,7 @@ def test_a_recording_holds_what_the_sensor_gave(seeker):
     game = next(record(seeker, max_steps=5, progress=lambda steps, score: told.append((steps, score))))
     assert [steps for steps, _ in told] == [1, 2, 3, 4, 5]
     sensor = seeker.agent.sensor.packed
-    assert game.images[0].shape == (5, 25, 25) and sensor.layout == "packed"
+    assert game.images[0].shape == (5, 25, 25) and not sensor.in_place
     frames = [np.asarray(to_frame(jnp.asarray(screen[..., 0]), None)) for screen in game.screens]
     np.testing.assert_allclose(game.mean_frame, np.mean(frames, axis=0), atol=1e-6)
     for frame, point, image in zip(frames, game.focal_point, game.images[0], strict=True):
