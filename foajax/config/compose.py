@@ -131,9 +131,11 @@ def _first_line(error: Exception) -> str:
 
 @functools.cache
 def _rings() -> tuple[str, ...]:
-    """The paper's sensors but for the whole frame: the files that leave the layout open."""
+    """The paper's sensors but for the whole frame: the files of rings that leave the layout open."""
     files = (file for file in experiments().glob("sensor/*.yaml") if file.stem != _WHOLE)
-    return tuple(sorted(file.stem for file in files if "layout" not in yaml.safe_load(file.read_text())))
+    return tuple(
+        sorted(file.stem for file in files if not {"kind", "layout"} & yaml.safe_load(file.read_text()).keys())
+    )
 
 
 def _packed() -> tuple[str, ...]:

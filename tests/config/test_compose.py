@@ -70,19 +70,26 @@ def test_without_a_word_every_key_has_its_default():
 
 
 def test_the_experiments_are_the_papers_their_packed_layouts_and_our_own():
-    assert list_experiments() == sorted([*TABLE_II, *PACKED, "logpolar", "seek"])
+    search = [
+        "detect_rings",
+        *(f"search_{kind}" for kind in ("full", "logpolar", "rings", "rings_p", "wide", "window")),
+    ]
+    assert list_experiments() == sorted([*TABLE_II, *PACKED, "logpolar", "seek", *search])
 
 
 @pytest.mark.parametrize("name", list_experiments())
 def test_an_experiment_has_its_name_and_its_sensor(name):
     config = composed(f"experiment={name}")
     assert config.name == name
-    assert config.gaze.mode == ("none" if name == "nonfoa" else "learned")
+    assert config.gaze.mode == ("none" if name in ("nonfoa", "search_full") else "learned")
     if name == "logpolar":
         assert nominal_values(config.sensor) == 1225 and config.gaze.bounds == "point"
         return
     if name == "seek":
         assert config.game == "seek" and config.sensor.window == (16, 16)
+        return
+    if name.startswith(("search_", "detect_")):
+        assert config.game == name.partition("_")[0] and config.env.frame_shape == (160, 160)
         return
     window, values, peripheral = TABLE_II[name.removesuffix("_packed")]
     assert config.sensor.window == window

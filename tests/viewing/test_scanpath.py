@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import ImageColor
 
-from foajax.viewing import scanpath
-from foajax.learning.agent import Agent
 from foajax.config.compose import compose
-from foajax.viewing.style import NATURAL, VISION
+from foajax.learning.agent import Agent
+from foajax.viewing import scanpath
 from foajax.viewing.recording import record
+from foajax.viewing.style import NATURAL, VISION
 
 
 @pytest.fixture(scope="module")
