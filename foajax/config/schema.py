@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -123,7 +124,7 @@ SensorConfig = RingSensor | LogPolarSensor | OwnSensor
 def _kind(value: Any) -> str | None:
     """Which sensor a value is; rings where it is not said."""
     kind = str(value.get("kind", "rings")) if isinstance(value, Mapping) else getattr(value, "kind", None)
-    return CODE if kind is not None and ":" in kind else kind
+    return CODE if kind is not None and re.fullmatch(r"[\w.]+:[\w.]+", kind) else kind
 
 
 class GazeConfig(Section):

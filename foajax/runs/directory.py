@@ -34,9 +34,7 @@ _BEFORE = {
         **{"lstm_norm": False, "padding": "valid", "focal_point": "packed", "focal_scale": "frame"},
         **{"dense_norm": False, "last_actions": False, "last_reward": False, "forget_bias": 0.0},
     },
-    "learner": {
-        **{"full_rate_inputs": None, "amsgrad": True, "value_target": "n_step", "credits_last_gaze": True},
-    },
+    "learner": {"amsgrad": True, "value_target": "n_step"},
 }
 # What may change between two starts of a run: none of it changes what a step learns.
 FREE = {

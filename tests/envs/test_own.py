@@ -1,14 +1,12 @@
 """Environments of one's own, and arguments of a constructor."""
 
-import dataclasses
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 from foajax.config.compose import compose
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, replace
 from foajax.envs import seek
 from foajax.envs.atari import check_game
 from foajax.envs.make import action_names, make, steps_per_second
@@ -82,6 +80,6 @@ def test_what_cannot_be_made_is_one_line(words, message):
 def test_names_of_code_are_told_from_ours():
     names = ["breakout", "seek", "probe:gaze", "gymnasium:foajax-shades-v0", "gymnasium:ale_py:ALE/Pong-v5"]
     config = own()
-    assert not any(dataclasses.replace(config, game=name).code for name in names)
+    assert not any(replace(config, game=name).code for name in names)
     for name in ("mine:walk", "gymnasium:mine:Walk-v0"):
-        assert dataclasses.replace(config, game=name).code == [f"game={name}"]
+        assert replace(config, game=name).code == [f"game={name}"]
