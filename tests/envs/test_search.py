@@ -17,6 +17,8 @@ from foajax.envs import tasks as jax_envs
 from foajax.envs.make import action_names, make
 from foajax.envs.own import OWN
 
+pytestmark = pytest.mark.slow  # compiles many scenes
+
 EPISODES = 200
 VARIANTS = ["letter", "feature", "conjunction", "cued"]
 

@@ -12,6 +12,8 @@ from foajax.viewing import scanpath
 from foajax.viewing.recording import record
 from foajax.viewing.style import NATURAL, VISION
 
+pytestmark = pytest.mark.slow  # compiles many scenes
+
 
 @pytest.fixture(scope="module")
 def searched(untrained):
