@@ -63,4 +63,4 @@ def recording(breakout_agent):
     """The first decisions of a game of Breakout on the real emulator."""
     from foajax.viewing.recording import record
 
-    return next(record(breakout_agent, seed=4, max_steps=130))
+    return next(record(breakout_agent, seed=0, max_steps=130))

@@ -141,7 +141,7 @@ def test_each_environment_plays_the_same_number_of_games(seeker, monkeypatch):
 def test_a_game_of_other_actions_is_refused(seeker):
     other = dataclasses.replace(seeker, agent=Agent(seeker.agent.config, 3, None))
     for watch in (lambda: next(record(other)), lambda: play(other, episodes=1, num_envs=1, seed=0, greedy=False)):
-        with pytest.raises(ConfigError, match="^game=seek: has 2 actions; accepted are 3, as in training$"):
+        with pytest.raises(ConfigError, match="^game=seek: has 2 actions; accepted is 3, as in training$"):
             watch()
 
 
