@@ -2,8 +2,9 @@
 
 A letter is the mask of a glyph of DejaVu Sans Bold, 11 pixels high, filled with a checkerboard of single pixels, on a
 plate of even gray. Any mean over a block of even sides sees the plate; of the letter it sees only the corners of its
-strokes, and with a sign that is drawn anew for each letter. The masks are smoothed, which makes that a sixteenth of
-the checkerboard's depth at most. So low resolution tells where a letter is, not which one or how it is turned.
+strokes, and with a sign that is drawn anew for each letter. The masks are smoothed, which makes that an eighth of the
+checkerboard's depth at most, and a 32nd in blocks of 4x4. So low resolution tells where a letter is,
+not which one or how it is turned.
 """
 
 from __future__ import annotations

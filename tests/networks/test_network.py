@@ -40,7 +40,10 @@ def test_every_experiment_has_four_outputs_or_two(experiment, torso):
     output, _ = jax.eval_shape(lambda: network.apply(params(), roi, side, is_first, state))
     assert output.natural_logits.shape == (3, 2, 4) and output.natural_value.shape == (3, 2)
     if agent.config.gaze.learned:
-        assert output.vision_logits.shape == (3, 2, agent.config.gaze.actions) and output.vision_value.shape == (3, 2)
+        assert output.vision_logits.shape == (3, 2, agent.config.gaze.num_actions) and output.vision_value.shape == (
+            3,
+            2,
+        )
     else:
         assert output.vision_logits is None and output.vision_value is None
 
