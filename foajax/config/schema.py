@@ -134,25 +134,25 @@ class GazeConfig(Section):
     mode: Literal["none", "learned", "frozen", "random", "scripted"] = Field(
         "learned", description="What moves the focal point; none for a sensor that shows the whole frame."
     )
-    moves: Literal["steps", "absolute"] = Field(
-        "steps", description="What a visual action is: a step, or a cell of a grid to look at."
-    )
     actions: Literal[5, 9] = Field(
         5, description="Directions of steps: stay, up, down, left, right; 9 adds the diagonals."
     )
     step: int | tuple[int, ...] = Field(
         4, description="Frame pixels of a step; several sizes, rising, give an action each per direction."
     )
-    grid: Grid = Field((5, 5), description="Cells that an absolute move chooses from.")
-    cost: float = Field(0.0, ge=0, description="Price of a saccade, taken from the reward that is learned from.")
-    cost_per: Literal["pixel", "saccade"] = Field(
-        "pixel", description="What is counted: frame pixels moved, or saccades of any length."
-    )
     bounds: Literal["window", "fovea", "point"] = Field(
         "window", description="What has to stay inside the frame: the whole area, its finest part, or the point alone."
     )
     start: Literal["centre", "random"] | Point = Field("centre", description="Start of an episode, moved in bounds.")
     path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved in bounds.")
+    moves: Literal["steps", "absolute"] = Field(
+        "steps", description="What a visual action is: a step, or a cell of a grid to look at."
+    )
+    grid: Grid = Field((5, 5), description="Cells that an absolute move chooses from.")
+    cost: float = Field(0.0, ge=0, description="Price of a saccade, taken from the reward that is learned from.")
+    cost_per: Literal["pixel", "saccade"] = Field(
+        "pixel", description="What is counted: frame pixels moved, or saccades of any length."
+    )
 
     def check(self) -> None:
         sizes = self.sizes

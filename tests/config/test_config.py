@@ -279,7 +279,7 @@ def test_a_config_is_a_key_of_a_mapping_wherever_it_comes_from(config):
 
 def test_a_section_with_other_values_is_checked_again():
     assert replace(RINGS.gaze, step=8) == GazeConfig(step=8)
-    with pytest.raises(ConfigError, match="^gaze.step=0: accepted is an integer from 1 to 10000$"):
+    with pytest.raises(ConfigError, match="^gaze.step=0: accepted is an integer from 1 to 10000, or a rising list"):
         replace(RINGS.gaze, step=0)
     with pytest.raises(ConfigError, match="^seed=-1: accepted is "):
         replace(RINGS, seed=-1)
@@ -288,7 +288,7 @@ def test_a_section_with_other_values_is_checked_again():
 def test_a_section_takes_its_first_keys_by_place():
     assert RingSensor([[8, 8, 1]]) == RingSensor(rings=((8, 8, 1),))
     with pytest.raises(TypeError):
-        GazeConfig("learned", 5, 4, "point", "centre", (), 7)
+        GazeConfig("learned", 5, 4, "point", "centre", (), "steps", (5, 5), 0.0, "pixel", 7)
 
 
 @pytest.mark.parametrize("near, word", [("learner.num_epoch", "num_epochs"), ("sed", "seed"), ("gaze.moode", "mode")])

@@ -49,7 +49,8 @@ def some_and_all(keys):
 
 @pytest.mark.parametrize("key", some_and_all(KEYS))
 def test_a_wrong_type_is_one_line_from_the_command_line_too(key):
-    value = "[[x],{y:1}]" if key in FREE_TEXT | {"env.crop_top"} else "{no_key: 1}"
+    takes_mappings = key in FREE_TEXT | {"env.crop_top"} or key.endswith("kwargs")
+    value = "[[x],{y:1}]" if takes_mappings else "{no_key: 1}"
     assert_refused([*KEYS[key], f"{key}={value}"], key, "accepted")
 
 
