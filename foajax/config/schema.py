@@ -216,8 +216,8 @@ class SearchConfig(Section):
         "letter", description="What tells the target: its letter, its brightness, both, or a cue shown first."
     )
     set_sizes: tuple[Letters, ...] = Field((8,), min_length=1, description="Letters in a scene, drawn from these.")
-    targets: tuple[Letters, ...] = Field(
-        (1,), min_length=1, description="Targets among them, drawn from these; all point the same way."
+    staircase: bool = Field(
+        False, description="Train on scenes with several targets first, one fewer per right answer, two more per wrong."
     )
     absent: bool = Field(False, description="Half of the scenes have no target, and one more answer says so.")
     classes: Literal[2, 4] = Field(2, description="Ways that the target may point, and answers.")
@@ -232,8 +232,6 @@ class SearchConfig(Section):
     clutter: int = Field(0, ge=0, le=1000, description="Bars between the letters.")
 
     def check(self) -> None:
-        if max(self.targets) > max(self.set_sizes):
-            raise refuse("targets", self.targets, "a list of integers >= 1, none above search.set_sizes")
         if not 0 < self.contrast[0] <= self.contrast[1] <= 1:
             raise refuse("contrast", self.contrast, "[least, most] in (0, 1]")
 

@@ -45,7 +45,8 @@ def pooled(tables: Iterable[Facts]) -> Facts:
 def summarise(facts: Facts) -> dict[str, float]:
     """The measures of visual search over some episodes, by name; empty for facts of other tasks.
 
-    Episodes with several targets, a help in learning, are left out where there are others.
+    Episodes with several targets, a help in learning, are left out where there are others; `targets` says how many
+    there were on average.
 
     - `accuracy`: share of right answers. `decisions`, `fixations`: how many an episode takes, until the answer.
     - `on_target`: share of the fixations that land on the target, where there is one.
@@ -56,10 +57,13 @@ def summarise(facts: Facts) -> dict[str, float]:
     """
     if "set_size" not in facts or not len(facts["set_size"]):
         return {}
+    row = {}
+    if (facts["targets"] > 1).any():
+        row["targets"] = float(facts["targets"].mean())
     if (alone := facts["targets"] <= 1).any():
         facts = {name: values[alone] for name, values in facts.items()}
     right, present, sizes = facts["right"], facts["targets"] > 0, facts["set_size"]
-    row = {name: float(facts[key].mean()) for name, key in _MEANS.items()}
+    row |= {name: float(facts[key].mean()) for name, key in _MEANS.items()}
     if present.any():
         row["on_target"] = float(facts["on_target"][present].sum() / facts["fixations"][present].sum())
     known = np.unique(sizes)

@@ -2,10 +2,14 @@
 
 A scene is static. It has a number of letters on plates (`foajax.envs.glyphs`), one to a cell of 20 pixels, cells drawn
 without replacement, and each somewhere in its cell. One of them is the target: with `search.target=letter`, the one T
-among Ls. (There may be several, `search.targets`, all turned alike, and in half of those scenes one in the middle: a
-help in learning what a target is.) The task `search` asks which way its foot points. The task `detect` asks where it
+among Ls. The task `search` asks which way its foot points. The task `detect` asks where it
 is: the answer "here" is right if the target lies inside the finest ring around the focal point, so this task reads the
 gaze.
+
+Who cannot read letters yet is best off guessing at once, and who guesses never learns to read. So training may begin
+with scenes full of targets, all turned alike, in half of which one lies in the middle (`search.staircase`): after a
+right answer an environment's next scene has one target fewer, after a wrong one two more. This is a weighted up-down
+staircase (Kaernbach 1991), which settles where two of three answers are right, or at one target.
 
 Action 0 waits. Each decision costs `search.price`. An answer ends the episode: 1 if it is right, -1 if not; so does
 the `search.max_fixations`-th decision, which counts as a wrong answer where it only waits. Full sight earns
@@ -47,6 +51,7 @@ class SearchState(NamedTuple):
     answer: Int[Array, ""]  # the right action
     set_size: Int[Array, ""]  # letters in the scene
     targets: Int[Array, ""]  # how many of them are targets
+    step: Int[Array, ""]  # of the staircase: targets that a scene of this episode would have if none were absent
     boxes: Int[Array, "k 4"]  # of the targets' plates: top, left, height, width; zeros where there are fewer
     time: Int[Array, ""]  # decisions made
     point: Int[Array, "2"]  # where the last one looked
@@ -81,6 +86,7 @@ def _task(config: Config, *, here: bool) -> Task:
         num_actions=len(action_names(config)),
         frame_shape=frame_shape,
         start=partial(_start, search, frame_shape, here),
+        follow=partial(_follow, search, frame_shape, here) if search.staircase else None,
         advance=rules,
         draw=partial(_draw, search),
         reads_gaze=True,
@@ -116,13 +122,21 @@ def facts(state: SearchState) -> dict[str, Array]:
     }
 
 
-def _start(search: SearchConfig, frame_shape: tuple[int, int], here: bool, key: Key[Array, ""]) -> SearchState:
+def _start(
+    search: SearchConfig,
+    frame_shape: tuple[int, int],
+    here: bool,
+    key: Key[Array, ""],
+    step: Int[Array, ""] | None = None,
+) -> SearchState:
     count = max(search.set_sizes)
+    most = count if search.staircase else 1
+    step = jnp.int32(most) if step is None else step
     place_key, scene_key, letter_key, noise_key = jax.random.split(key, 4)
     # One draw for all that is uniform: many small ones would take most of an episode's time.
-    size, number, presence, asked, middle = jax.random.uniform(scene_key, (5,))
-    set_size = _one_of(search.set_sizes, size)
-    targets = jnp.minimum(_one_of(search.targets, number), set_size)
+    size, presence, asked, middle = jax.random.uniform(scene_key, (4,))
+    set_size = jnp.asarray(search.set_sizes, jnp.int32)[_whole(size, len(search.set_sizes))]
+    targets = jnp.minimum(step, set_size)
     targets = jnp.where(presence < 0.5, 0, targets) if search.absent else targets
     asked = _whole(asked, search.classes)
     corners = _places(place_key, frame_shape, count + search.clutter, (targets > 1) & (middle < 0.5))
@@ -135,7 +149,7 @@ def _start(search: SearchConfig, frame_shape: tuple[int, int], here: bool, key: 
         bars = _bars(jax.random.fold_in(scene_key, 1), search.clutter)
         scene = _paste(scene, bars, corners[count:], jnp.ones(search.clutter, bool))
     answers = 1 if here else search.classes
-    boxes = jnp.concatenate([corners, jnp.full_like(corners, glyphs.PLATE)], axis=-1)[: max(search.targets)]
+    boxes = jnp.concatenate([corners, jnp.full_like(corners, glyphs.PLATE)], axis=-1)[:most]
     zero = jnp.int32(0)
     return SearchState(
         scene=_noisy(noise_key, scene, search.noise),
@@ -143,6 +157,7 @@ def _start(search: SearchConfig, frame_shape: tuple[int, int], here: bool, key: 
         answer=jnp.where(targets > 0, 1 if here else 1 + asked, 1 + answers).astype(jnp.int32),
         set_size=set_size,
         targets=targets,
+        step=step,
         boxes=jnp.where(jnp.arange(len(boxes))[:, None] < targets, boxes, 0),
         time=zero,
         point=jnp.full(2, -1, jnp.int32),
@@ -154,13 +169,17 @@ def _start(search: SearchConfig, frame_shape: tuple[int, int], here: bool, key: 
     )
 
 
+def _follow(
+    search: SearchConfig, frame_shape: tuple[int, int], here: bool, before: SearchState, key: Key[Array, ""]
+) -> SearchState:
+    """The episode after `before`, one step further on the staircase."""
+    step = jnp.clip(before.step + jnp.where(before.right, -1, 2), 1, max(search.set_sizes))
+    return _start(search, frame_shape, here, key, step)
+
+
 def _whole(share: Float[Array, "*n"], number: int) -> Int[Array, "*n"]:
     """0 .. number - 1, equally likely where `share` is uniform in [0, 1)."""
     return jnp.minimum((share * number).astype(jnp.int32), number - 1)
-
-
-def _one_of(choices: tuple[int, ...], share: Float[Array, ""]) -> Int[Array, ""]:
-    return jnp.asarray(choices, jnp.int32)[_whole(share, len(choices))]
 
 
 def _places(

@@ -32,6 +32,8 @@ class Task(NamedTuple):
     draw: Callable[[TaskState], UInt8[Array, "H W"]]  # the screen, gray, 0..255
     reads_gaze: bool = False
     facts: Callable[[TaskState], dict[str, Array]] | None = None  # about the episode, for measures
+    # The first state of an episode, from the last one of the episode before; None where episodes are independent.
+    follow: Callable[[TaskState, Key[Array, ""]], TaskState] | None = None
 
 
 class EnvState(NamedTuple):
@@ -54,11 +56,12 @@ def observe(task: Task, state: EnvState) -> TimeStep:
     )
 
 
-def reset(task: Task, key: Key[Array, ""]) -> tuple[EnvState, TimeStep]:
-    """Begins the first episode."""
+def reset(task: Task, key: Key[Array, ""], before: TaskState | None = None) -> tuple[EnvState, TimeStep]:
+    """Begins the first episode, or the one that follows upon the last state of another."""
     next_key, start_key = jax.random.split(key)
+    start = task.start if task.follow is None or before is None else partial(task.follow, before)
     state = EnvState(
-        task=task.start(start_key),
+        task=start(start_key),
         key=next_key,
         reward=jnp.float32(0),
         is_first=jnp.bool_(True),
@@ -71,7 +74,7 @@ def step(
     task: Task, state: EnvState, action: Int[Array, ""], focal_point: Int[Array, "2"] | None = None
 ) -> tuple[EnvState, TimeStep]:
     """Takes `action` or, after a terminal, ignores it and begins the next episode with reward 0."""
-    fresh, _ = reset(task, state.key)
+    fresh, _ = reset(task, state.key, state.task)
     taken = _take(task, state, action, focal_point)
     after = jax.tree.map(lambda a, b: jnp.where(state.is_terminal, a, b), fresh, taken)
     return after, observe(task, after)
@@ -85,7 +88,8 @@ def step_all(
     order = jnp.argsort(~over, stable=True)  # those that are over come first
 
     def begin(i: Int[Array, ""], after: EnvState) -> EnvState:
-        fresh, _ = reset(task, after.key[order[i]])
+        last = jax.tree.map(lambda every: every[order[i]], state)
+        fresh, _ = reset(task, last.key, last.task)
         return jax.tree.map(lambda every, one: every.at[order[i]].set(one), after, fresh)
 
     taken = jax.vmap(partial(_take, task))(state, action, focal_point)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from foajax.config.parse import refuse
+from foajax.config.parse import refuse, replace
 from foajax.envs.base import Environment, facts, send
 from foajax.envs.make import make
 from foajax.envs.measures import Facts, pooled
@@ -31,6 +31,8 @@ class Games(NamedTuple):
 def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool = False) -> Environment:
     """What an agent is watched in: the game that it was trained in, with seeds apart from those of training.
 
+    Scenes of visual search are all as they shall be found, without the staircase that training may begin with.
+
     Raises:
       ConfigError: a seed out of range; no such game, or one whose actions are no longer those of the training.
     """
@@ -39,6 +41,7 @@ def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool 
     config, actions = stored.agent.config, stored.agent.num_actions
     # An engine adds an environment's number to its seed: neighbouring seeds may not lie side by side.
     first = int(np.random.SeedSequence([_WATCHED, seed]).generate_state(1)[0] >> 2)
+    config = replace(config, search=replace(config.search, staircase=False))
     made = make(config, num_envs=num_envs, seed=first, render=render)
     if made.num_actions != actions:
         made.close()

@@ -281,6 +281,25 @@ def test_a_letter_leaves_an_eighth_of_its_depth_in_block_means(block):
     assert 0.01 < max(left) <= 0.5 * block**-2 + 1e-6
 
 
+def test_the_staircase_goes_down_by_one_and_up_by_two():
+    environment = make(configured("search.staircase=true", "search.set_sizes=[6]"), num_envs=2, seed=0)
+    assert isinstance(environment, jax_envs.JaxEnvironment)
+    environment.reset()
+    levels = []
+    for right in [True] * 7 + [False, False, True]:
+        state = jax.tree.map(np.asarray, environment.get_state().task)
+        levels.append(state.targets.tolist())
+        assert [len(plates(state, i)) for i in range(2)] == [6, 6]
+        assert ((state.boxes[..., 2] > 0).sum(1) == state.targets).all()
+        # The second environment is always wrong.
+        answer = np.where([right, False], state.answer, 3 - state.answer)
+        for action in (answer, np.zeros(2)):  # the step after an episode's end is nobody's
+            environment.send(action.astype(np.int32), centres(state))
+            environment.recv()
+    assert [first for first, _ in levels] == [6, 5, 4, 3, 2, 1, 1, 1, 3, 5]
+    assert {second for _, second in levels} == {6}
+
+
 def test_environments_begin_the_same_episodes_together_and_alone():
     """`step_all` gives what `step` gives, at an episode's end too."""
     task = search.search(configured())
