@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import shlex
 
+import numpy as np
 import pytest
 
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, flatten, to_mapping
 from foajax.reporting import kept
 from foajax.runs.directory import FREE, load_config
+from foajax.viewing import heatmap
+from foajax.viewing.heatmap import HeatMap
 
 RUNS = [path for path in sorted(kept.KEPT.glob("*/*")) if path.is_dir()]
 
@@ -67,10 +70,24 @@ def test_a_run_is_kept_by_game_experiment_and_seed(run):
     assert out == kept.KEPT / "seek" / "seek-s3"
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 500
     assert json.loads((out / "run.json").read_text())["command"] == "python -m foajax.train experiment=seek seed=3"
-    kept.write_tables(kept.KEPT)
+    assert not (out / "render").exists()
+    kept.write_table(kept.KEPT)
     table = (kept.KEPT / "README.md").read_text()
     assert "| seek | `seek` | 3 | 281 | learned | 0.0 M | 0.0 | 9.0 ± 0.5 | [seek/seek-s3](seek/seek-s3) |" in table
-    assert (kept.KEPT / "seek.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(("env_steps", "is_kept"), [(2000, True), (1000, False)])
+def test_the_heat_map_of_the_final_policy_is_kept(run, env_steps, is_kept):
+    bounds = np.array([0, 0]), np.array([4, 4])
+    whose = {"env_steps": env_steps, "policy": "sampled", "whole_games": True}
+    (run / "render").mkdir()
+    heatmap.save(HeatMap(np.eye(5, dtype=int), np.zeros((5, 5)), *bounds, games=2, **whose), run / "render", "seek")
+    assert (heatmap.of_run(kept.keep(run, None), 2000) is not None) == is_kept
+
+
+def test_numbers_are_kept_to_five_digits(run):
+    row = {"env_steps": 123_456_789, "time": 1.23456789, "score": 0.5, "note": None}
+    assert kept._rounded(row) == row | {"time": 1.2346}
 
 
 def test_a_score_of_fewer_games_is_refused(run):

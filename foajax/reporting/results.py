@@ -1,0 +1,285 @@
+"""docs/results.md and the README's block: figures, tables and the paper's claims, all made from kept runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from foajax.config import shipped
+from foajax.config.parse import refuse
+from foajax.reporting.claims import CLAIMS, NOT_RUN, RULES, WATCHED, Claim, Finding, Game, ask, over, score, told
+from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, read_run
+from foajax.reporting.groups import PRESETS, differing_keys, games_of
+from foajax.reporting.scores import REFERENCE, Interval
+from foajax.sensors.registry import make_sensor
+from foajax.viewing import heatmap
+
+ROOT = shipped.kept_runs().parents[1]
+GAMES = {"breakout": "Breakout", "pong": "Pong", "beam_rider": "Beam Rider"}
+_GAZES = ("nonfoa", "constant70_p", *(f"constant70_p-{mode}" for mode in ("frozen", "random", "scripted")))
+FIGURES = {  # title, and whose curves
+    "constant": ("constant resolution (Fig. 7)", PRESETS["constant"]),
+    "decreasing": ("decreasing resolution (Fig. 8)", PRESETS["decreasing"]),
+    "peripheral": ("peripheral vision (Fig. 9)", PRESETS["peripheral"]),
+    "gaze": ("what moves the gaze", _GAZES),
+}
+_COMPARED = {*PAPER_NAMES, *_GAZES, "logpolar", "constant70_p, canvas"}
+_AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")}
+BLOCK = re.compile(r"(<!-- results: [^>]*-->\n).*?(<!-- /results -->)", re.DOTALL)
+
+
+def read(directory: Path) -> dict[str, Game]:
+    """Kept runs by game; `time` is in core seconds.
+
+    Raises:
+      ConfigError: runs of a game that are compared differ in more than sensor, gaze and seed.
+    """
+    runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
+    games = {}
+    for name, groups in games_of(runs, None).items() if runs else ():
+        if name not in GAMES:
+            continue
+        labelled = {_label(seeds[0]): [_in_core_time(run) for run in seeds] for seeds in groups.values()}
+        _check_protocol([labelled[each] for each in labelled if each in _COMPARED])
+        heats = {label: list(filter(None, map(_heat, seeds))) for label, seeds in labelled.items()}
+        games[name] = Game(name, labelled, heats)
+    return games
+
+
+def _label(run: RunData) -> str:
+    """The experiment's name without `_packed`; a sensor that could be packed and is not is called a canvas."""
+    name = run.config.name.replace("_packed", "")
+    is_canvas = make_sensor(run.config.sensor).in_place and name != "nonfoa"
+    return f"{name}, canvas" if is_canvas else name
+
+
+def _in_core_time(run: RunData) -> RunData:
+    return run._replace(time=run.time * _facts(run)["cores"])
+
+
+def _facts(run: RunData) -> dict[str, Any]:
+    return json.loads((run.path / "run.json").read_text())
+
+
+def _heat(run: RunData) -> heatmap.HeatMap | None:
+    return heatmap.of_run(run.path, _facts(run)["env_steps"])
+
+
+def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
+    first = [seeds[0] for seeds in groups]
+    for key, values in differing_keys(first).items():
+        if not key.startswith(("sensor.", "gaze.")):
+            other = next(run for run, value in zip(first, values, strict=True) if value != values[0])
+            accepted = f"the same {key} as in {first[0].path}"
+            raise refuse(str(other.path), accepted=accepted, why="is compared with runs of another kind")
+    steps = first[0].config.train.env_steps if first else 0
+    for run in (run for seeds in groups for run in seeds):
+        done = _facts(run)["env_steps"]
+        if run.config.train.env_steps != steps or done < steps:
+            why = f"has {done:,} of {run.config.train.env_steps:,} env_steps"
+            raise refuse(str(run.path), accepted=f"{steps:,}, as {first[0].path} has", why=why)
+
+
+def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
+    """The text of docs/results.md.
+
+    Args:
+      games: kept runs, by game.
+      costs: what `foajax cost` measured of each experiment.
+    """
+    findings = {claim.title: {game: ask(claim, games.get(game, Game(game, {}))) for game in GAMES} for claim in CLAIMS}
+    parts = [
+        "# Results",
+        _INTRODUCTION,
+        "## Does the paper hold?",
+        _verdicts([claim for claim in CLAIMS if claim.says], findings, "the paper's claim"),
+        "Questions of ours:",
+        _verdicts([claim for claim in CLAIMS if not claim.says], findings, "question"),
+        "How a verdict is reached:",
+        RULES,
+        "## Claim by claim",
+        *(_section(claim, findings[claim.title]) for claim in CLAIMS),
+        *(_game(games[game], costs) if game in games else f"## {GAMES[game]}\nNot run yet." for game in GAMES),
+        _SENSORS,
+        _protocol([run for game in games.values() for seeds in game.runs.values() for run in seeds]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+_INTRODUCTION = """\
+The paper's seven sensors on its three games, with controls that it does not show. `foajax reproduce` makes the runs.
+`foajax keep` keeps them and writes this page; no figure on it is written by hand."""
+
+_SENSORS = """\
+## What the sensors show (Figs. 5 and 6)
+Left the frame with the focal area and the focal point, right what the sensor gives, put back in its place.
+
+![Constant: two places of the gaze](results/constant.png)
+
+![Decreasing(P): two places of the gaze](results/decreasing_p.png)
+
+Drawn by `foajax show sensor=constant70 points=[[35,35],[45,45]] out=docs/results/constant.png`, and the same with
+`decreasing_p`."""
+
+
+_PROTOCOL = """\
+## How the runs were made
+The default learner for 3,000,000 decisions (Pong 1,500,000) of 4 frames each, the packed layout where a sensor has one.
+100 whole games of the final policy, actions sampled, give the score. A point of a curve is the mean of the last 100
+games of training, with no other smoothing; 500 points of each curve are kept. Where there are several seeds, thin lines
+are seeds, the thick line is their mean, and the band its 95 % interval by bootstrap over seeds. Core hours are hours
+times cores; other work on the machine lengthens them. Commands, commits and machines of all runs:
+[results/runs](../results/runs/README.md)."""
+
+
+def _protocol(runs: Sequence[RunData]) -> str:
+    facts = [_facts(run) for run in runs]
+
+    def each(values: Iterable[str]) -> str:
+        return ", ".join(sorted(set(values)))
+
+    text = _PROTOCOL
+    if facts:
+        pythons, cpus = each(fact["python"] for fact in facts), each(fact["cpu"] for fact in facts)
+        text += f"\n\nPython {pythons}, jax {each(fact['packages']['jax'] for fact in facts)}, {cpus}."
+    return text
+
+
+def _verdicts(claims: Sequence[Claim], findings: Mapping[str, Mapping[str, Finding]], head: str) -> str:
+    rows = [
+        [
+            f"[{claim.title}](#{_anchor(claim.title)})",
+            *(_bold(finding.verdict) for finding in findings[claim.title].values()),
+        ]
+        for claim in claims
+    ]
+    return table([head, *GAMES.values()], rows)
+
+
+def _bold(verdict: str) -> str:
+    return f"**{verdict}**" if verdict in ("holds", "does not hold") else verdict
+
+
+def _anchor(title: str) -> str:
+    """As GitHub makes them."""
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+
+
+def _section(claim: Claim, findings: Mapping[str, Finding]) -> str:
+    says = f"The paper: “{claim.says}”\n\n" if claim.says else ""
+    seen = [
+        f"- {GAMES[game]}: {_bold(finding.verdict)}. {'; '.join(finding.seen)}".removesuffix(". ")
+        for game, finding in findings.items()
+        if finding.verdict != NOT_RUN
+    ]
+    return f"### {claim.title}\n{says}{claim.asks}\n\n" + ("\n".join(seen) or "Not run yet.")
+
+
+def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
+    name = GAMES[game.name]
+    parts = [f"## {name}", _scores(game, costs)]
+    for file, (title, labels) in FIGURES.items():
+        if any(label in game.runs for label in labels):
+            left = [f"`{label}`" for label in labels if label not in game.runs]
+            parts.append(f"![{name}: {title}](results/{game.name}-{file}.png)")
+            parts += [f"Not run yet: {', '.join(left)}."] if left else []
+    for label in WATCHED:
+        if game.heats.get(label):
+            parts.append(f"![{name}: where {label} looks (Fig. 10)](results/{game.name}-heat-{label}.png)")
+    return "\n\n".join(parts)
+
+
+_COLUMNS = ["agent", "pixel values", "seeds", "score", "of `nonfoa`", "MFLOP", "ms alone", "ms of 32", "core hours"]
+_SCORES = """\
+Score: mean of 100 games [95 %], over seeds or else over the games. A decision's MFLOP and its time on a CPU, alone and
+as one of 32 at once: [cost.json](../results/bench/cost.json)."""
+
+
+def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
+    order = [*PAPER_NAMES, *(label for label in game.runs if label not in PAPER_NAMES)]
+    rows = [
+        _row(game, label, costs) if label in game.runs else [f"`{label}`", "", "", NOT_RUN, "", *_cost(None), ""]
+        for label in order
+    ]
+    return f"{table(_COLUMNS, rows)}\n\n{_SCORES}"
+
+
+def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str]:
+    runs, chance = game.runs[label], REFERENCE[game.name][0]
+    config = runs[0].config
+    of_whole = over(*(_above(game.runs[name], chance) for name in (label, "nonfoa"))) if "nonfoa" in game.runs else None
+    measured = (config.name.split("-")[0], config.network.torso)
+    return [
+        f"`{label}`",
+        f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
+        str(len(runs)),
+        str(score(runs)),
+        told(of_whole) if of_whole and label != "nonfoa" else "",
+        *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
+        f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
+    ]
+
+
+def _cost(record: Mapping[str, Any] | None) -> list[str]:
+    if record is None:
+        return ["", "", ""]
+    alone, together = record["decision_us_batch1"] / 1e3, record["decision_us_batch32"] / 32e3
+    return [f"{record['decision_flops'] / 1e6:.1f}", f"{alone:.2f}", f"{together:.2f}"]
+
+
+def _above(runs: Sequence[RunData], chance: float) -> Interval:
+    return Interval(*(each - chance for each in score(runs)))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str | None:
+    """What the README shows: Breakout with the gaze learned, moved otherwise or not at all; None before it was run."""
+    game = games.get("breakout", Game("breakout", {}))
+    if not all(label in game.runs for label in _GAZES[:3]):
+        return None
+    rows = [_row(game, label, costs)[:5] for label in _GAZES if label in game.runs]
+    seeds = {len(game.runs[label]) for label in _GAZES if label in game.runs}
+    verdicts = [ask(claim, game).verdict for claim in CLAIMS if claim.says]
+    counts = [f"{verdict} {verdicts.count(verdict)}" for verdict in dict.fromkeys(verdicts)]
+    return (
+        "![A learned gaze, the same eye held still, and the whole frame](docs/results/breakout-gaze.png)\n\n"
+        f"{table(['agent', 'pixel values', 'seeds', 'score', 'of `nonfoa`'], rows)}\n\n"
+        f"Breakout, {'one seed each' if seeds == {1} else '95 % intervals over seeds'}; 100 whole games. "
+        f"The paper's {len(verdicts)} claims, on Breakout: {', '.join(counts)}. [All results](docs/results.md).\n"
+    )
+
+
+def draw(games: Mapping[str, Game], directory: Path) -> None:
+    """Draws the figures of the page."""
+    for game in games.values():
+        title = GAMES[game.name]
+        for file, (what, labels) in FIGURES.items():
+            groups = {label: game.runs[label] for label in labels if label in game.runs}
+            if groups:
+                figure = draw_curves(groups, f"{title}: {what}", colours_of(groups), _AXES)
+                figure.savefig(directory / f"{game.name}-{file}.png", dpi=120)
+        for label in WATCHED:
+            if heats := game.heats.get(label):
+                figure = heatmap.draw(heats[0], f"{label} on {title}")
+                figure.savefig(directory / f"{game.name}-heat-{label}.png", dpi=120)
+
+
+def write(root: Path = ROOT) -> None:
+    """Makes docs/results.md, its figures and the README's block anew from `results/` of a checkout."""
+    games = read(root / "results" / "runs")
+    costs = json.loads((root / "results" / "bench" / "cost.json").read_text())
+    (root / "docs" / "results").mkdir(exist_ok=True)
+    draw(games, root / "docs" / "results")
+    (root / "docs" / "results.md").write_text(page(games, costs))
+    readme = root / "README.md"
+    if text := block(games, costs):
+        readme.write_text(BLOCK.sub(lambda found: found[1] + text + found[2], readme.read_text()))
