@@ -134,8 +134,8 @@ def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) ->
 
 
 def told(number: Interval) -> str:
-    """A number and its interval, in three digits."""
-    value, low, high = (f"{each:.3g}" for each in number)
+    """A number and its interval, in three digits or whole numbers."""
+    value, low, high = (f"{each:,.0f}" if 1000 <= abs(each) < math.inf else f"{each:.3g}" for each in number)
     return f"{value} [{low}, {high}]" if low != high else value
 
 
@@ -157,11 +157,11 @@ def _compare(
 
 
 def _scores(*pairs: tuple[str, str]) -> Callable[[Game], list[Part | None]]:
-    return functools.partial(_compare, score, "score", pairs)
+    return functools.partial(_compare, score, "Score", pairs)
 
 
 def _training(share: float, *pairs: tuple[str, str]) -> Callable[[Game], list[Part | None]]:
-    what = "mean score in training" if share == 1 else f"mean score in the first {100 * share:.0f} % of training"
+    what = "Mean score in training" if share == 1 else f"Mean score in the first {100 * share:.0f} % of training"
     return functools.partial(_compare, functools.partial(training_score, share=share), what, pairs)
 
 
@@ -257,14 +257,14 @@ CLAIMS = (
         "The gaze stays in the lower half",
         "the focal point is mostly kept centered at the bottom half of the screen",
         "Share of the decisions with the focal point below the middle, `constant70` and `decreasing_p`: above 0.5.",
-        *(0.5, math.inf, _gaze("share_below", "share below the middle")),
+        *(0.5, math.inf, _gaze("share_below", "Share below the middle")),
     ),
     Claim(
         "The gaze moves little",
         "the agent does not move its focal point very much",
         "Spread of the focal point over that of one which is everywhere within its bounds, `constant70` and "
         "`decreasing_p`: below 0.5.",
-        *(-math.inf, 0.5, _gaze("relative_spread", "relative spread")),
+        *(-math.inf, 0.5, _gaze("relative_spread", "Relative spread")),
     ),
     Claim(
         "Without gaze control it is much worse",

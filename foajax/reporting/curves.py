@@ -152,6 +152,7 @@ def draw_curves(
                 style = {"color": colours[name], "linestyle": lines[name]}
                 ends[name] = _draw_group(plot, runs, axis, unit, style)
             plot.set_xlabel(label)
+            plot.margins(x=0)
             plot.set_xlim(left=0)
             plot.grid(axis="y", color="#e6e6e6", linewidth=0.8)
             plot.set_axisbelow(True)

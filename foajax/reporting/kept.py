@@ -32,6 +32,10 @@ def keep(path: Path, name: str | None) -> Path:
     if found != wanted:
         command = f"evaluate run={path} json={path}/score.json"
         raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
+    heat = heatmap.of_run(path, newest)
+    if heat is None and run.config.gaze.mode == "learned":
+        command = f"render run={path} episodes=10 video=false"
+        raise refuse("run", path, f"what {command} writes", why="has no heat map of its final policy in render/")
     config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
     out = KEPT / game / (name or f"{config.name}-s{config.seed}")
@@ -44,7 +48,7 @@ def keep(path: Path, name: str | None) -> Path:
     rows = [row for line in lines if (row := parse_row(line)) and row["env_steps"] <= newest]
     chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
     (out / "metrics.jsonl").write_text("".join(json.dumps(_rounded(rows[i])) + "\n" for i in chosen))
-    if heat := heatmap.of_run(path, newest):
+    if heat is not None:
         (out / "render").mkdir(exist_ok=True)
         (out / "render" / heatmap.FILE).write_text(json.dumps(heat.to_json()) + "\n")
     (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
 
 from foajax.config import shipped
 from foajax.config.parse import refuse
@@ -21,12 +24,16 @@ from foajax.viewing import heatmap
 
 ROOT = shipped.kept_runs().parents[1]
 GAMES = {"breakout": "Breakout", "pong": "Pong", "beam_rider": "Beam Rider"}
-_GAZES = ("nonfoa", "constant70_p", *(f"constant70_p-{mode}" for mode in ("frozen", "random", "scripted")))
-FIGURES = {  # title, and whose curves
-    "constant": ("constant resolution (Fig. 7)", PRESETS["constant"]),
-    "decreasing": ("decreasing resolution (Fig. 8)", PRESETS["decreasing"]),
-    "peripheral": ("peripheral vision (Fig. 9)", PRESETS["peripheral"]),
-    "gaze": ("what moves the gaze", _GAZES),
+_GAZES = {
+    "nonfoa": "whole frame",
+    "constant70_p": "gaze learned",
+    **{f"constant70_p-{mode}": f"gaze {mode}" for mode in ("frozen", "random", "scripted")},
+}
+FIGURES: dict[str, tuple[str, Mapping[str, str]]] = {  # title, and whose curves by which names
+    "constant": ("constant resolution (Fig. 7)", {name: name for name in PRESETS["constant"]}),
+    "decreasing": ("decreasing resolution (Fig. 8)", {name: name for name in PRESETS["decreasing"]}),
+    "peripheral": ("peripheral vision (Fig. 9)", {name: name for name in PRESETS["peripheral"]}),
+    "gaze": ("the whole frame, and a fifth of it", _GAZES),
 }
 _COMPARED = {*PAPER_NAMES, *_GAZES, "logpolar", "constant70_p, canvas"}
 _AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")}
@@ -113,7 +120,7 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
 
 _INTRODUCTION = """\
 The paper's seven sensors on its three games, with controls that it does not show. `foajax reproduce` makes the runs.
-`foajax keep` keeps them and writes this page; no figure on it is written by hand."""
+`foajax keep` keeps them and writes this page; no figure on it is written by hand. [What each sensor is](experiments.md)."""
 
 _SENSORS = """\
 ## What the sensors show (Figs. 5 and 6)
@@ -173,7 +180,7 @@ def _anchor(title: str) -> str:
 def _section(claim: Claim, findings: Mapping[str, Finding]) -> str:
     says = f"The paper: “{claim.says}”\n\n" if claim.says else ""
     seen = [
-        f"- {GAMES[game]}: {_bold(finding.verdict)}. {'; '.join(finding.seen)}".removesuffix(". ")
+        f"- {GAMES[game]}: {_bold(finding.verdict)}. {'. '.join(finding.seen)}."
         for game, finding in findings.items()
         if finding.verdict != NOT_RUN
     ]
@@ -196,8 +203,8 @@ def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
 
 _COLUMNS = ["agent", "pixel values", "seeds", "score", "of `nonfoa`", "MFLOP", "ms alone", "ms of 32", "core hours"]
 _SCORES = """\
-Score: mean of 100 games [95 %], over seeds or else over the games. A decision's MFLOP and its time on a CPU, alone and
-as one of 32 at once: [cost.json](../results/bench/cost.json)."""
+Score: mean of 100 games [95 %], over seeds or else over the games; of `nonfoa`: the ratio of what is above random play.
+A decision's MFLOP and its time on a CPU, alone and as one of 32 at once: [cost.json](../results/bench/cost.json)."""
 
 
 def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
@@ -218,7 +225,7 @@ def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str
         f"`{label}`",
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
         str(len(runs)),
-        str(score(runs)),
+        told(score(runs)),
         told(of_whole) if of_whole and label != "nonfoa" else "",
         *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
         f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
@@ -242,19 +249,21 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str | None:
-    """What the README shows: Breakout with the gaze learned, moved otherwise or not at all; None before it was run."""
+    """What the README shows: Breakout, the whole frame and a gaze moved in several ways; None before it was run."""
     game = games.get("breakout", Game("breakout", {}))
-    if not all(label in game.runs for label in _GAZES[:3]):
+    there = [label for label in _GAZES if label in game.runs]
+    if there[:3] != list(_GAZES)[:3]:
         return None
-    rows = [_row(game, label, costs)[:5] for label in _GAZES if label in game.runs]
-    seeds = {len(game.runs[label]) for label in _GAZES if label in game.runs}
+    rows = [[f"{_GAZES[label]} ({cells[0]})", *cells[1:5]] for label in there for cells in [_row(game, label, costs)]]
+    one = any(len(game.runs[label]) == 1 for label in there)
+    over_what = "over seeds, or over the games where there is one seed" if one else "over seeds"
     verdicts = [ask(claim, game).verdict for claim in CLAIMS if claim.says]
-    counts = [f"{verdict} {verdicts.count(verdict)}" for verdict in dict.fromkeys(verdicts)]
+    counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in dict.fromkeys(verdicts))
     return (
-        "![A learned gaze, the same eye held still, and the whole frame](docs/results/breakout-gaze.png)\n\n"
-        f"{table(['agent', 'pixel values', 'seeds', 'score', 'of `nonfoa`'], rows)}\n\n"
-        f"Breakout, {'one seed each' if seeds == {1} else '95 % intervals over seeds'}; 100 whole games. "
-        f"The paper's {len(verdicts)} claims, on Breakout: {', '.join(counts)}. [All results](docs/results.md).\n"
+        "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
+        f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
+        f"Breakout, 100 whole games, 95 % intervals {over_what}.\n"
+        f"The paper's {len(verdicts)} claims on Breakout: {'; '.join(counts)}. [All results](docs/results.md).\n"
     )
 
 
@@ -263,14 +272,20 @@ def draw(games: Mapping[str, Game], directory: Path) -> None:
     for game in games.values():
         title = GAMES[game.name]
         for file, (what, labels) in FIGURES.items():
-            groups = {label: game.runs[label] for label in labels if label in game.runs}
-            if groups:
-                figure = draw_curves(groups, f"{title}: {what}", colours_of(groups), _AXES)
-                figure.savefig(directory / f"{game.name}-{file}.png", dpi=120)
+            if there := {label: shown for label, shown in labels.items() if label in game.runs}:
+                groups = {shown: game.runs[label] for label, shown in there.items()}
+                colours = {there[label]: colour for label, colour in colours_of(there).items()}
+                _save(draw_curves(groups, f"{title}: {what}", colours, _AXES), directory / f"{game.name}-{file}.png")
         for label in WATCHED:
             if heats := game.heats.get(label):
-                figure = heatmap.draw(heats[0], f"{label} on {title}")
-                figure.savefig(directory / f"{game.name}-heat-{label}.png", dpi=120)
+                _save(heatmap.draw(heats[0], f"{label} on {title}"), directory / f"{game.name}-heat-{label}.png")
+
+
+def _save(figure: Figure, file: Path) -> None:
+    """As a PNG of 128 colours, a third of the size."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=120)
+    Image.open(content).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
 def write(root: Path = ROOT) -> None:

@@ -62,7 +62,16 @@ def run(tmp_path, monkeypatch):
         "returns": [9.0] * 100,
     }
     (path / "score.json").write_text(json.dumps(score))
+    watch(path, env_steps=2000)
     return path
+
+
+def watch(path, env_steps):
+    """Leaves a heat map, as `render` does."""
+    bounds = np.array([0, 0]), np.array([4, 4])
+    whose = {"env_steps": env_steps, "policy": "sampled", "whole_games": True}
+    (path / "render").mkdir(exist_ok=True)
+    heatmap.save(HeatMap(np.eye(5, dtype=int), np.zeros((5, 5)), *bounds, games=2, **whose), path / "render", "seek")
 
 
 def test_a_run_is_kept_by_game_experiment_and_seed(run):
@@ -70,19 +79,18 @@ def test_a_run_is_kept_by_game_experiment_and_seed(run):
     assert out == kept.KEPT / "seek" / "seek-s3"
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 500
     assert json.loads((out / "run.json").read_text())["command"] == "python -m foajax.train experiment=seek seed=3"
-    assert not (out / "render").exists()
+    assert heatmap.of_run(out, 2000).games == 2
     kept.write_table(kept.KEPT)
     table = (kept.KEPT / "README.md").read_text()
     assert "| seek | `seek` | 3 | 281 | learned | 0.0 M | 0.0 | 9.0 ± 0.5 | [seek/seek-s3](seek/seek-s3) |" in table
 
 
-@pytest.mark.parametrize(("env_steps", "is_kept"), [(2000, True), (1000, False)])
-def test_the_heat_map_of_the_final_policy_is_kept(run, env_steps, is_kept):
-    bounds = np.array([0, 0]), np.array([4, 4])
-    whose = {"env_steps": env_steps, "policy": "sampled", "whole_games": True}
-    (run / "render").mkdir()
-    heatmap.save(HeatMap(np.eye(5, dtype=int), np.zeros((5, 5)), *bounds, games=2, **whose), run / "render", "seek")
-    assert (heatmap.of_run(kept.keep(run, None), 2000) is not None) == is_kept
+def test_a_gaze_without_a_heat_map_of_the_final_policy_is_refused(run):
+    watch(run, env_steps=1000)
+    with pytest.raises(
+        ConfigError, match="has no heat map of its final policy in render/; accepted is what render run="
+    ):
+        kept.keep(run, None)
 
 
 def test_numbers_are_kept_to_five_digits(run):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,14 +28,11 @@ COSTS = [
 ]
 
 
-def run_of(mean, *, seed=0, pace=1.0, config=CONFIG):
+def run_of(mean, *, seed=0, pace=1.0):
     """A run whose games score `mean` on average, and whose curve ends there after having risen at its pace."""
     returns = mean + np.random.default_rng(seed).normal(0, 0.02 * abs(mean), 100)
     score = mean * np.minimum(1, pace * STEPS / STEPS[-1])
-    return RunData(CONFIG_PATH, config, STEPS, STEPS / 700, score, {"mean": returns.mean(), "returns": list(returns)})
-
-
-CONFIG_PATH = results.ROOT
+    return RunData(Path(), CONFIG, STEPS, STEPS / 700, score, {"mean": returns.mean(), "returns": list(returns)})
 
 
 def seeds_of(mean, pace=1.0, number=3):
@@ -49,9 +47,8 @@ def heat_of(*points):
 
 LOW, HIGH = [(44, 40)] * 9 + [(45, 41)], [(36, 40)] * 9 + [(45, 40)]
 STILL, RESTLESS = LOW, [(y, x) for y in (35, 45) for x in (35, 45)]
-NAMES = {part for names in (*curves.PAPER_NAMES, "logpolar", "constant70_p, canvas") for part in [names]} | {
-    f"constant70_p-{mode}" for mode in ("frozen", "random", "scripted")
-}
+CONTROLS = [f"constant70_p{what}" for what in ("-frozen", "-random", "-scripted", ", canvas")]
+NAMES = [*curves.PAPER_NAMES, *CONTROLS, "logpolar"]
 # Of each claim: who scores how much, at which pace, where it holds and where it does not; 100 at pace 1 for the others.
 BOTH_WAYS = {
     "Lower resolution at 50x50 hurts": ({"constant50_sub2": (50, 1)}, {"constant50_sub2": (150, 1)}),
@@ -124,7 +121,7 @@ def test_seeds_that_overlap_cannot_tell():
     one = {"constant50_sub1": [run_of(100)], "constant50_sub2": [run_of(100.1, seed=1)]}
     finding = ask(CLAIMS[0], Game("breakout", one))
     assert finding.verdict == "one seed cannot tell"
-    assert finding.seen[0].startswith("score: `constant50_sub1` 100 [99.8, 101], ")
+    assert finding.seen[0].startswith("Score: `constant50_sub1` 100 [99.8, 101], ")
 
 
 def test_an_interval_is_that_of_an_independent_bootstrap():
@@ -155,11 +152,10 @@ def test_labels_are_spread():
 
 
 def test_a_sensor_has_one_colour_whatever_else_is_shown():
-    one = curves.colours_of(["constant70_p", "nonfoa"])
-    other = curves.colours_of(["mine", "constant70_p_packed-frozen", "Constant(P) 70x70, sub2", "constant70_p, canvas"])
-    blue = one["constant70_p"]
-    assert other["mine"] not in (blue, one["nonfoa"]) or other["mine"] != blue
-    assert [other[name] for name in list(other)[1:]] == [blue] * 3
+    names = ["mine", "nonfoa", "constant70_p_packed-frozen", "Constant(P) 70x70, sub2, packed", "constant70_p, canvas"]
+    mine, gray, *blue = curves.colours_of(names).values()
+    assert set(blue) == {curves.SENSORS["constant70_p"]} and gray == curves.SENSORS["nonfoa"]
+    assert mine not in (gray, *blue)
 
 
 # The page
@@ -205,7 +201,8 @@ def test_the_page_and_the_readme_of_some_runs(checkout):
     assert "| `decreasing` |  |  | not run yet |" in page and "## Pong\nNot run yet." in page
     assert "one seed suggests yes" in page and "Python 3.12.1, jax 0.11.2, a processor." in page
     assert readme.startswith("before\n<!-- results: made by x -->\n![") and "old" not in readme
-    assert readme.count("\n| `") == 3 and "\n<!-- /results -->\nafter\n" in readme
+    assert "| whole frame (`nonfoa`) | 6,400 | 1 | 120 [" in readme and readme.count("| gaze ") == 2
+    assert "\n<!-- /results -->\nafter\n" in readme
     for link in ("breakout-gaze.png", "breakout-constant.png", "breakout-heat-constant70.png"):
         assert f"(results/{link})" in page and (checkout / "docs/results" / link).stat().st_size > 5000
 
