@@ -120,7 +120,8 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
 
 _INTRODUCTION = """\
 The paper's seven sensors on its three games, with controls that it does not show. `foajax reproduce` makes the runs.
-`foajax keep` keeps them and writes this page; no figure on it is written by hand. [What each sensor is](experiments.md)."""
+`foajax keep` keeps them and writes this page; no figure on it is written by hand.
+[What each sensor is](experiments.md)."""
 
 _SENSORS = """\
 ## What the sensors show (Figs. 5 and 6)
