@@ -27,6 +27,9 @@ def keep(path: Path, name: str | None) -> Path:
     """Copies what matters of a run."""
     run = read_run(path)
     newest = newest_checkpoint(path) or int(run.env_steps[-1])  # rows of a run that was killed may go on beyond it
+    if newest < run.config.train.env_steps:
+        why = f"has {newest:,} of its {run.config.train.env_steps:,} env_steps"
+        raise refuse("run", path, "a finished run, or one that is given fewer train.env_steps", why=why)
     wanted = {"env_steps": newest, "policy": "sampled", "episodes": 100}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:

@@ -84,12 +84,10 @@ def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
             other = next(run for run, value in zip(first, values, strict=True) if value != values[0])
             accepted = f"the same {key} as in {first[0].path}"
             raise refuse(str(other.path), accepted=accepted, why="is compared with runs of another kind")
-    steps = first[0].config.train.env_steps if first else 0
-    for run in (run for seeds in groups for run in seeds):
-        done = _facts(run)["env_steps"]
-        if run.config.train.env_steps != steps or done < steps:
-            why = f"has {done:,} of {run.config.train.env_steps:,} env_steps"
-            raise refuse(str(run.path), accepted=f"{steps:,}, as {first[0].path} has", why=why)
+    lengths = {run.config.train.env_steps: run for seeds in groups for run in seeds}
+    for steps, run in list(lengths.items())[1:]:
+        accepted = f"{next(iter(lengths)):,}, as the runs that it is compared with"
+        raise refuse(str(run.path), accepted=accepted, why=f"is of {steps:,} env_steps")
 
 
 def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:

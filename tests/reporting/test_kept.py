@@ -98,6 +98,12 @@ def test_numbers_are_kept_to_five_digits(run):
     assert kept._rounded(row) == row | {"time": 1.2346}
 
 
+def test_a_run_that_is_not_finished_is_refused(run):
+    (run / "checkpoints" / "2000").rename(run / "checkpoints" / "1000")
+    with pytest.raises(ConfigError, match="has 1,000 of its 2,000 env_steps; accepted is a finished run"):
+        kept.keep(run, None)
+
+
 def test_a_score_of_fewer_games_is_refused(run):
     score = json.loads((run / "score.json").read_text())
     (run / "score.json").write_text(json.dumps(score | {"episodes": 30}))

@@ -217,15 +217,10 @@ def test_runs_of_another_kind_are_not_compared(checkout):
         results.read(checkout / "results/runs")
 
 
-@pytest.mark.parametrize(("steps", "done"), [(9_000_000, 9_000_000), (3_000_000, 2_000_000)])
-def test_runs_of_another_length_are_not_compared(checkout, steps, done):
-    runs = checkout / "results/runs"
-    path = keep_run(runs, ["game=breakout", "experiment=decreasing_packed"], 50, steps=steps)
-    (path / "run.json").write_text(json.dumps(json.loads((path / "run.json").read_text()) | {"env_steps": done}))
-    with pytest.raises(
-        ConfigError, match=f"decreasing_packed-s0: has {done:,} of {steps:,} env_steps; accepted is 3,000,000"
-    ):
-        results.read(runs)
+def test_runs_of_another_length_are_not_compared(checkout):
+    keep_run(checkout / "results/runs", ["game=breakout", "experiment=decreasing_packed"], 50, steps=9_000_000)
+    with pytest.raises(ConfigError, match="decreasing_packed-s0: is of 9,000,000 env_steps; accepted is 3,000,000, as"):
+        results.read(checkout / "results/runs")
 
 
 def test_the_page_in_the_repository_is_what_its_runs_say():
