@@ -263,7 +263,7 @@ CLAIMS = (
         "The gaze moves little",
         "the agent does not move its focal point very much",
         "Spread of the focal point over that of one which is everywhere within its bounds, `constant70` and "
-        "`decreasing_p`: below 0.5.",
+        "`decreasing_p`: below 0.5. The bounds are narrow, 11x11 pixels, as the 70x70 window stays inside the frame.",
         *(-math.inf, 0.5, _gaze("relative_spread", "Relative spread")),
     ),
     Claim(
