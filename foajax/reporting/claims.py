@@ -102,6 +102,12 @@ def training_score(runs: Sequence[RunData], *, share: float) -> Interval:
     return interval([np.array(means)], np.mean)
 
 
+def above_chance(score: Interval, game: str) -> Interval:
+    """What a score has above random play; all of it in a game without a reference."""
+    chance = REFERENCE.get(game, (0.0, 0.0))[0]
+    return Interval(*(each - chance for each in score))
+
+
 def over(a: Interval, b: Interval) -> Interval:
     """a / b of what is not negative; from the smallest to the largest ratio."""
     a, b = (Interval(*(max(each, 0.0) for each in given)) for given in (a, b))
@@ -143,14 +149,13 @@ def _compare(
     measure: Callable[[Sequence[RunData]], Interval], what: str, pairs: Sequence[tuple[str, str]], game: Game
 ) -> list[Part | None]:
     """A measure of one experiment over that of another, above random play, pair by pair."""
-    chance = REFERENCE.get(game.name, (0.0, 0.0))[0]
     parts: list[Part | None] = []
     for pair in pairs:
         if not all(name in game.runs for name in pair):
             parts.append(None)
             continue
         a, b = (measure(game.runs[name]) for name in pair)
-        found = over(*(Interval(*(each - chance for each in given)) for given in (a, b)))
+        found = over(above_chance(a, game.name), above_chance(b, game.name))
         seen = f"{what}: `{pair[0]}` {told(a)}, `{pair[1]}` {told(b)}; ratio {told(found)}"
         parts.append(Part(found, min(len(game.runs[name]) for name in pair), seen))
     return parts

@@ -15,10 +15,10 @@ from PIL import Image
 
 from foajax.config import shipped
 from foajax.config.parse import refuse
-from foajax.reporting.claims import CLAIMS, NOT_RUN, RULES, WATCHED, Claim, Finding, Game, ask, over, score, told
+from foajax.reporting import claims
+from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
 from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, read_run
 from foajax.reporting.groups import PRESETS, differing_keys, games_of
-from foajax.reporting.scores import REFERENCE, Interval
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import heatmap
 
@@ -97,7 +97,9 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
       games: kept runs, by game.
       costs: what `foajax cost` measured of each experiment.
     """
-    findings = {claim.title: {game: ask(claim, games.get(game, Game(game, {}))) for game in GAMES} for claim in CLAIMS}
+    findings = {
+        claim.title: {game: claims.ask(claim, games.get(game, Game(game, {}))) for game in GAMES} for claim in CLAIMS
+    }
     parts = [
         "# Results",
         _INTRODUCTION,
@@ -106,7 +108,7 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
         "Questions of ours:",
         _verdicts([claim for claim in CLAIMS if not claim.says], findings, "question"),
         "How a verdict is reached:",
-        RULES,
+        claims.RULES,
         "## Claim by claim",
         *(_section(claim, findings[claim.title]) for claim in CLAIMS),
         *(_game(games[game], costs) if game in games else f"## {GAMES[game]}\nNot run yet." for game in GAMES),
@@ -156,13 +158,13 @@ def _protocol(runs: Sequence[RunData]) -> str:
     return text
 
 
-def _verdicts(claims: Sequence[Claim], findings: Mapping[str, Mapping[str, Finding]], head: str) -> str:
+def _verdicts(chosen: Sequence[Claim], findings: Mapping[str, Mapping[str, Finding]], head: str) -> str:
     rows = [
         [
             f"[{claim.title}](#{_anchor(claim.title)})",
             *(_bold(finding.verdict) for finding in findings[claim.title].values()),
         ]
-        for claim in claims
+        for claim in chosen
     ]
     return table([head, *GAMES.values()], rows)
 
@@ -181,7 +183,7 @@ def _section(claim: Claim, findings: Mapping[str, Finding]) -> str:
     seen = [
         f"- {GAMES[game]}: {_bold(finding.verdict)}. {'. '.join(finding.seen)}."
         for game, finding in findings.items()
-        if finding.verdict != NOT_RUN
+        if finding.verdict != claims.NOT_RUN
     ]
     return f"### {claim.title}\n{says}{claim.asks}\n\n" + ("\n".join(seen) or "Not run yet.")
 
@@ -194,7 +196,7 @@ def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
             left = [f"`{label}`" for label in labels if label not in game.runs]
             parts.append(f"![{name}: {title}](results/{game.name}-{file}.png)")
             parts += [f"Not run yet: {', '.join(left)}."] if left else []
-    for label in WATCHED:
+    for label in claims.WATCHED:
         if game.heats.get(label):
             parts.append(f"![{name}: where {label} looks (Fig. 10)](results/{game.name}-heat-{label}.png)")
     return "\n\n".join(parts)
@@ -209,23 +211,25 @@ A decision's MFLOP and its time on a CPU, alone and as one of 32 at once: [cost.
 def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
     order = [*PAPER_NAMES, *(label for label in game.runs if label not in PAPER_NAMES)]
     rows = [
-        _row(game, label, costs) if label in game.runs else [f"`{label}`", "", "", NOT_RUN, "", *_cost(None), ""]
+        _row(game, label, costs) if label in game.runs else [f"`{label}`", "", "", claims.NOT_RUN, "", *_cost(None), ""]
         for label in order
     ]
     return f"{table(_COLUMNS, rows)}\n\n{_SCORES}"
 
 
 def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str]:
-    runs, chance = game.runs[label], REFERENCE[game.name][0]
-    config = runs[0].config
-    of_whole = over(*(_above(game.runs[name], chance) for name in (label, "nonfoa"))) if "nonfoa" in game.runs else None
+    runs, whole = game.runs[label], game.runs.get("nonfoa")
+    config, found = runs[0].config, claims.score(runs)
+    of_whole = whole and claims.over(
+        claims.above_chance(found, game.name), claims.above_chance(claims.score(whole), game.name)
+    )
     measured = (config.name.split("-")[0], config.network.torso)
     return [
         f"`{label}`",
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
         str(len(runs)),
-        told(score(runs)),
-        told(of_whole) if of_whole and label != "nonfoa" else "",
+        claims.told(found),
+        claims.told(of_whole) if of_whole and label != "nonfoa" else "",
         *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
         f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
     ]
@@ -236,10 +240,6 @@ def _cost(record: Mapping[str, Any] | None) -> list[str]:
         return ["", "", ""]
     alone, together = record["decision_us_batch1"] / 1e3, record["decision_us_batch32"] / 32e3
     return [f"{record['decision_flops'] / 1e6:.1f}", f"{alone:.2f}", f"{together:.2f}"]
-
-
-def _above(runs: Sequence[RunData], chance: float) -> Interval:
-    return Interval(*(each - chance for each in score(runs)))
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -256,7 +256,7 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str 
     rows = [[f"{_GAZES[label]} ({cells[0]})", *cells[1:5]] for label in there for cells in [_row(game, label, costs)]]
     one = any(len(game.runs[label]) == 1 for label in there)
     over_what = "over seeds, or over the games where there is one seed" if one else "over seeds"
-    verdicts = [ask(claim, game).verdict for claim in CLAIMS if claim.says]
+    verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
     counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in dict.fromkeys(verdicts))
     return (
         "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
@@ -275,7 +275,7 @@ def draw(games: Mapping[str, Game], directory: Path) -> None:
                 groups = {shown: game.runs[label] for label, shown in there.items()}
                 colours = {there[label]: colour for label, colour in colours_of(there).items()}
                 _save(draw_curves(groups, f"{title}: {what}", colours, _AXES), directory / f"{game.name}-{file}.png")
-        for label in WATCHED:
+        for label in claims.WATCHED:
             if heats := game.heats.get(label):
                 _save(heatmap.draw(heats[0], f"{label} on {title}"), directory / f"{game.name}-heat-{label}.png")
 
