@@ -1,8 +1,9 @@
 """`python -m foajax.keep run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/<game>/`.
 
 Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
-json=<run>/score.json` has found, and `run.json`: command, commits, seed, machine, hours. Then the tables and the
-learning curves of all kept runs are made anew. Without `run=`, only that.
+json=<run>/score.json` has found, the heat map that `render` has left in `<run>/render`, and `run.json`: command,
+commits, seed, machine, hours. Then the table of kept runs, docs/results.md with its figures, and the README's block
+are made anew. Without `run=`, only that.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import Section, refuse
-from foajax.reporting import kept
+from foajax.reporting import kept, results
 
 
 class Options(Section):
     """What the command takes."""
 
-    run: str | None = Field(None, description="A run's directory; null to make the tables anew only.")
+    run: str | None = Field(None, description="A run's directory; null to make the tables and figures anew only.")
     name: str | None = Field(None, description="Directory that it is kept in; null for <experiment>-s<seed>.")
 
 
@@ -32,7 +33,8 @@ def keep(arguments: Sequence[str]) -> None:
         raise refuse(str(kept.KEPT), accepted="a checkout, which has kept runs", why="is missing")
     if options.run is not None:
         print(kept.keep(Path(options.run), options.name))
-    kept.write_tables()
+    kept.write_table()
+    results.write()
 
 
 if __name__ == "__main__":

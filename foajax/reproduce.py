@@ -1,9 +1,11 @@
 """`python -m foajax.reproduce stage=1 jobs=2`: the paper's comparison, run by run, each evaluated in 100 games.
 
+Where a gaze is learned, ten more games make its heat map.
+
 `experiments/reproduce.yaml` has the stages. A run that is finished is skipped and one that was stopped goes on, so the
 same command is given again and again until nothing is left. `show=table` says how far each run is; `show=commands`
 prints a command for each run that is left, as for the tasks of a cluster's job array. `python -m foajax.keep
-run=<dir>` keeps a run in results/.
+run=<dir>` keeps a run in results/ and writes what it says to docs/results.md.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from foajax.runs.directory import is_run
 from foajax.runs.status import inspect, is_finished
 
 _EPISODES = 100  # whole games that a final policy is scored in
+_WATCHED = 10  # and in which its gaze is watched
 
 
 class Options(Section):
@@ -68,17 +71,22 @@ def reproduce(arguments: Sequence[str]) -> int:
             )
             continue
         print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
-        failed |= sweep.run_all(runs, jobs=options.jobs) | _evaluate(runs, options.jobs)
+        failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs)
     return failed
 
 
-def _evaluate(runs: Sequence[sweep.Run], jobs: int) -> int:
-    """Plays the games of finished runs that have not been scored; 1 where that failed."""
-    left = [run.config for run in runs if is_finished(run.config) and not _score(run).exists()]
-    words = [[f"run={config.run_dir}", f"episodes={_EPISODES}", f"json={config.run_dir}/score.json"] for config in left]
+def _play(runs: Sequence[sweep.Run], jobs: int) -> int:
+    """Plays the games of finished runs: for their scores, and for heat maps of learned gazes; 1 where that failed."""
+    commands = []
+    for run in runs:
+        where = run.config.run_dir
+        if is_finished(run.config) and not _score(run).exists():
+            commands.append(["foajax.evaluate", f"run={where}", f"episodes={_EPISODES}", f"json={_score(run)}"])
+        if is_finished(run.config) and run.config.gaze.mode == "learned" and not Path(where, "render").exists():
+            commands.append(["foajax.render", f"run={where}", f"episodes={_WATCHED}", "video=false"])
     with ThreadPoolExecutor(jobs) as pool:
-        commands = [[sys.executable, "-m", "foajax.evaluate", *each] for each in words]
-        return max([int(code != 0) for code in pool.map(subprocess.call, commands)], default=0)
+        codes = pool.map(lambda command: subprocess.call([sys.executable, "-m", *command]), commands)
+        return max([int(code != 0) for code in codes], default=0)
 
 
 def _score(run: sweep.Run) -> Path:

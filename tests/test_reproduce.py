@@ -23,6 +23,7 @@ def short(tmp_path, monkeypatch):
     lines = ["experiment=seek seed=0,1 train.env_steps=640 env.num_envs=4 train.log_every=0.1"]
     monkeypatch.setattr(reproduce, "stages", lambda: [{"about": "a short stage", "runs": lines}])
     monkeypatch.setattr(reproduce, "_EPISODES", 2)
+    monkeypatch.setattr(reproduce, "_WATCHED", 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -47,6 +48,7 @@ def test_a_stage_is_trained_evaluated_and_then_left_alone(short, capsys):
     assert cli.run(reproduce.reproduce, ["jobs=2"]) == 0
     for seed in (0, 1):
         assert json.loads((short / f"runs/seek-seek-s{seed}/score.json").read_text())["episodes"] == 2
+        assert json.loads((short / f"runs/seek-seek-s{seed}/render/heatmap.json").read_text())["games"] == 1
     capsys.readouterr()
     assert cli.run(reproduce.reproduce, ["jobs=2"]) == 0
     assert capsys.readouterr().err.count("finished already") == 2

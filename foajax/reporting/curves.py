@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,10 +22,30 @@ from foajax.runs.directory import load_config
 from foajax.runs.rows import parse_row
 from foajax.viewing.style import STYLE
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
-_LINES = ("-", "--", ":")  # once all colours are used
+SENSORS = {  # a colour each, the same in every figure; the pairs with and without a periphery are of one hue
+    "nonfoa": "#444444",
+    "constant50_sub1": "#009e73",
+    "constant50_sub2": "#cc79a7",
+    "constant70": "#56b4e9",
+    "decreasing": "#e69f00",
+    "constant70_p": "#0072b2",
+    "decreasing_p": "#d55e00",
+    "logpolar": "#8c6d31",
+}
+PAPER_NAMES = {
+    "nonfoa": "Non-FoA, sub1",
+    "constant50_sub1": "Constant 50x50, sub1",
+    "constant50_sub2": "Constant 50x50, sub2",
+    "constant70": "Constant 70x70, sub2",
+    "decreasing": "Decreasing 30-50-70",
+    "constant70_p": "Constant(P) 70x70, sub2",
+    "decreasing_p": "Decreasing(P) 30-50-70",
+}
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
+_LINES = ("-", "--", ":", "-.")  # of those who share a colour
 _POINTS = 300  # of a curve
 AXES = {"env_steps": (1e6, "million agent steps"), "time": (3600.0, "hours of training")}
+_LABEL_GAP = 0.085  # between labels at the lines' ends, of the axis's height
 
 
 class RunData(NamedTuple):
@@ -75,58 +97,103 @@ def read_run(path: str | Path, *, trust: bool = False) -> RunData:
     return RunData(path, config, env_steps, time, score, evaluation)
 
 
-def band(runs: Sequence[RunData], axis: str) -> Band | None:
-    """The mean curve over seeds where all have scores, with a bootstrap interval; None where that is nowhere."""
+def on_common_axis(
+    runs: Sequence[RunData], axis: str
+) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "n m"]] | None:
+    """The runs' scores at the same places of an axis, where all have scores; None where that is nowhere."""
     xs = [getattr(run, axis) for run in runs]
     first, last = max(each[0] for each in xs), min(each[-1] for each in xs)
     if first >= last:
         return None
     x = np.linspace(first, last, _POINTS)
-    curves = np.stack([np.interp(x, each, run.score) for each, run in zip(xs, runs, strict=True)])
+    return x, np.stack([np.interp(x, each, run.score) for each, run in zip(xs, runs, strict=True)])
+
+
+def band(runs: Sequence[RunData], axis: str) -> Band | None:
+    """The mean curve over seeds where all have scores, with a bootstrap interval; None where that is nowhere."""
+    common = on_common_axis(runs, axis)
+    if common is None:
+        return None
+    x, curves = common
     drawn = np.random.default_rng(0).integers(0, len(runs), (RESAMPLES, len(runs)))
     means = curves[drawn].mean(axis=1)
     low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
     return Band(x, curves.mean(axis=0), low, high)
 
 
+def sensor_of(name: str) -> str:
+    """The sensor that an experiment is named after: `constant70_p` of `constant70_p_packed-frozen`."""
+    papers = {paper: sensor for sensor, paper in PAPER_NAMES.items()}
+    return papers.get(name.removesuffix(", packed")) or re.split(r"\W", name)[0].removesuffix("_packed")
+
+
 def colours_of(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each name, the same in all figures of a report."""
-    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(dict.fromkeys(names))}
+    """A colour for each name: its sensor's where that has one, else one that no sensor among them has."""
+    colours = {name: SENSORS.get(sensor_of(name)) for name in names}
+    free = itertools.cycle([colour for colour in _COLOURS if colour not in colours.values()] or _COLOURS)
+    return {name: colour or next(free) for name, colour in colours.items()}
 
 
-def draw_curves(groups: Mapping[str, Sequence[RunData]], title: str, colours: Mapping[str, str]) -> Figure:
-    """Score against steps and against time; a colour for each group of seeds, every seed thin."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(10.4, 4.1), layout="constrained")
-        plots = figure.subplots(1, 2, sharey=True)
-        lines = {name: _LINES[i // len(COLOURS) % len(_LINES)] for i, name in enumerate(colours)}
-        for plot, (axis, (unit, label)) in zip(plots, AXES.items(), strict=True):
+def draw_curves(
+    groups: Mapping[str, Sequence[RunData]],
+    title: str,
+    colours: Mapping[str, str],
+    axes: Mapping[str, tuple[float, str]] = AXES,
+) -> Figure:
+    """Score against steps and against time; a line for each group of seeds, named at its end, every seed thin."""
+    shared = list(colours.values())
+    lines = {name: _LINES[shared[:i].count(colours[name]) % len(_LINES)] for i, name in enumerate(colours)}
+    with rc_context(STYLE | {"font.size": 12, "axes.titlesize": 12}):
+        figure = Figure(figsize=(6.8, 0.3 + 3.1 * len(axes)), layout="constrained")
+        plots = figure.subplots(len(axes), 1, sharey=True, squeeze=False)[:, 0]
+        for plot, (axis, (unit, label)) in zip(plots, axes.items(), strict=True):
+            ends = {}
             for name, runs in groups.items():
-                _draw_group(plot, runs, axis, unit, {"color": colours[name], "linestyle": lines[name]}, name)
+                style = {"color": colours[name], "linestyle": lines[name]}
+                ends[name] = _draw_group(plot, runs, axis, unit, style)
             plot.set_xlabel(label)
+            plot.margins(x=0)
             plot.set_xlim(left=0)
             plot.grid(axis="y", color="#e6e6e6", linewidth=0.8)
             plot.set_axisbelow(True)
-        plots[0].set_ylabel("score of a game, mean of the last 100")
+            _name_lines(plot, ends, colours)
+            plot.set_ylabel("score of a game")
         plots[0].set_title(title, loc="left", fontweight="bold")
-        handles, labels = plots[0].get_legend_handles_labels()
-        columns = max(1, min(4, 140 // (max(map(len, labels)) + 6)))  # as many as the figure's width has room for
-        figure.legend(handles, labels, loc="outside lower center", ncols=columns)
     return figure
 
 
-def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, line: dict[str, str], name: str) -> None:
-    if len(runs) > 1:
-        for run in runs:
-            plot.plot(getattr(run, axis) / unit, run.score, **line, linewidth=0.6, alpha=0.45)
-        mean, label = band(runs, axis), f"{name} ({len(runs)} seeds)"
-        if mean is None:
-            plot.plot([], [], **line, linewidth=2, label=label)
-        else:
-            plot.fill_between(mean.x / unit, mean.low, mean.high, color=line["color"], alpha=0.16, linewidth=0)
-            plot.plot(mean.x / unit, mean.mean, **line, linewidth=2, label=label)
-    else:
-        plot.plot(getattr(runs[0], axis) / unit, runs[0].score, **line, linewidth=1.8, label=name)
+def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, line: dict[str, str]) -> float:
+    """Draws a group; returns where its line ends."""
+    mean = band(runs, axis) if len(runs) > 1 else None
+    for run in runs:
+        thin = {"linewidth": 0.6, "alpha": 0.45} if len(runs) > 1 else {"linewidth": 1.8}
+        plot.plot(getattr(run, axis) / unit, run.score, **line, **thin)
+    if mean is None:
+        return float(np.mean([run.score[-1] for run in runs]))
+    plot.fill_between(mean.x / unit, mean.low, mean.high, color=line["color"], alpha=0.16, linewidth=0)
+    plot.plot(mean.x / unit, mean.mean, **line, linewidth=2)
+    return float(mean.mean[-1])
+
+
+def _name_lines(plot: Any, ends: Mapping[str, float], colours: Mapping[str, str]) -> None:
+    """Writes each line's name to the right of the plot, at the height of its end or as near as there is room."""
+    low, high = plot.get_ylim()
+    for name, height in zip(ends, spread(list(ends.values()), _LABEL_GAP * (high - low)), strict=True):
+        place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "annotation_clip": False}
+        plot.annotate(name, (1, height), xycoords=plot.get_yaxis_transform(), color=colours[name], **place)
+
+
+def spread(wanted: Sequence[float], gap: float) -> list[float]:
+    """Places in the order of those `wanted` and at least `gap` apart, as near to them as can be."""
+    order = np.argsort(wanted, kind="stable")
+    blocks: list[list[float]] = []
+    for i, place in enumerate(np.asarray(wanted, float)[order]):
+        blocks.append([place - i * gap])
+        while len(blocks) > 1 and np.mean(blocks[-2]) > np.mean(blocks[-1]):
+            blocks[-2:] = [blocks[-2] + blocks[-1]]
+    placed = np.empty(len(order))
+    placed[order] = np.concatenate([[np.mean(block)] * len(block) for block in blocks]) + gap * np.arange(len(order))
+    return placed.tolist()
 
 
 def draw_scores(intervals: Mapping[str, Mapping[str, Interval]], colours: Mapping[str, str]) -> Figure:

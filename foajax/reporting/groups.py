@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from foajax.config.parse import flatten, refuse, to_mapping
-from foajax.reporting.curves import RunData
+from foajax.reporting.curves import PAPER_NAMES, RunData
 from foajax.reporting.scores import Interval, interval, iqm, normalised
 from foajax.runs.directory import FREE
 
@@ -17,15 +17,6 @@ PRESETS = {
     "constant": ("nonfoa", "constant50_sub1", "constant50_sub2", "constant70"),
     "decreasing": ("constant70", "decreasing"),
     "peripheral": ("constant70_p", "decreasing_p", "constant70", "decreasing"),
-}
-_PAPER_NAMES = {
-    "nonfoa": "Non-FoA, sub1",
-    "constant50_sub1": "Constant 50x50, sub1",
-    "constant50_sub2": "Constant 50x50, sub2",
-    "constant70": "Constant 70x70, sub2",
-    "decreasing": "Decreasing 30-50-70",
-    "constant70_p": "Constant(P) 70x70, sub2",
-    "decreasing_p": "Decreasing(P) 30-50-70",
 }
 _NOT_COMPARED = FREE | {"seed", "game", "name"}
 Groups = dict[str, list[RunData]]  # seeds of the same experiment, by the experiment's name
@@ -60,7 +51,7 @@ def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
 
 def _label(name: str, preset: str | None) -> str:
     base = name.removesuffix("_packed")
-    return _PAPER_NAMES[base] + (", packed" if base != name else "") if preset else name
+    return PAPER_NAMES[base] + (", packed" if base != name else "") if preset else name
 
 
 def differing_keys(runs: Sequence[RunData]) -> dict[str, list[Any]]:

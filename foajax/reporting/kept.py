@@ -12,10 +12,11 @@ import yaml
 
 from foajax.config import shipped
 from foajax.config.parse import refuse, replace, to_mapping
-from foajax.reporting.curves import RunData, colours_of, draw_curves, read_run
-from foajax.reporting.groups import games_of
+from foajax.reporting.curves import RunData, read_run
+from foajax.runs.rows import parse_row
 from foajax.runs.status import newest_checkpoint
 from foajax.sensors.registry import make_sensor
+from foajax.viewing import heatmap
 
 KEPT = shipped.kept_runs()
 _ROWS = 500
@@ -26,11 +27,18 @@ def keep(path: Path, name: str | None) -> Path:
     """Copies what matters of a run."""
     run = read_run(path)
     newest = newest_checkpoint(path) or int(run.env_steps[-1])  # rows of a run that was killed may go on beyond it
+    if newest < run.config.train.env_steps:
+        why = f"has {newest:,} of its {run.config.train.env_steps:,} env_steps"
+        raise refuse("run", path, "a finished run, or one that is given fewer train.env_steps", why=why)
     wanted = {"env_steps": newest, "policy": "sampled", "episodes": 100}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"evaluate run={path} json={path}/score.json"
         raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
+    heat = heatmap.of_run(path, newest)
+    if heat is None and run.config.gaze.mode == "learned":
+        command = f"render run={path} episodes=10 video=false"
+        raise refuse("run", path, f"what {command} writes", why="has no heat map of its final policy in render/")
     config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
     out = KEPT / game / (name or f"{config.name}-s{config.seed}")
@@ -39,13 +47,20 @@ def keep(path: Path, name: str | None) -> Path:
         raise refuse("name", out.name, "another name=<name>-s<seed>", why="holds another run")
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(text)
-    rows = (path / "metrics.jsonl").read_text().splitlines(keepends=True)
-    rows = [row for row in rows if json.loads(row)["env_steps"] <= newest]
+    lines = (path / "metrics.jsonl").read_bytes().splitlines()
+    rows = [row for line in lines if (row := parse_row(line)) and row["env_steps"] <= newest]
     chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
-    (out / "metrics.jsonl").write_text("".join(rows[i] for i in chosen))
+    (out / "metrics.jsonl").write_text("".join(json.dumps(_rounded(rows[i])) + "\n" for i in chosen))
+    if heat is not None:
+        (out / "render").mkdir(exist_ok=True)
+        (out / "render" / heatmap.FILE).write_text(json.dumps(heat.to_json()) + "\n")
     (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")
     (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
     return out
+
+
+def _rounded(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: float(f"{value:.5g}") if isinstance(value, float) else value for key, value in row.items()}
 
 
 def _facts(run: RunData, newest: int) -> dict[str, Any]:
@@ -79,16 +94,15 @@ def row(run: RunData) -> list[str]:
     ]
 
 
-def write_tables(directory: Path = KEPT) -> None:
-    """Makes the table and the learning curves of all kept runs anew."""
+def write_table(directory: Path = KEPT) -> None:
+    """Makes the table of all kept runs anew."""
     runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
     head = ["game", "experiment", "seed", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     lines = [head, ["---"] * len(head), *map(row, runs)]
     intro = (
         "Score: mean and standard error over 100 whole games, unclipped, sampled policy, of the last checkpoint. Each\n"
-        "`run.json` has the command, the commit and the machine. Made by `python -m foajax.keep`."
+        "`run.json` has the command, the commit and the machine. [What they say](../../docs/results.md). Made by\n"
+        "`python -m foajax.keep`."
     )
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n")
-    for game, groups in games_of(runs, None).items():
-        draw_curves(groups, game, colours_of(groups)).savefig(directory / f"{game}.png", dpi=110)

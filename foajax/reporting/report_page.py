@@ -194,15 +194,11 @@ def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]
 
 def _stored_map(run: RunData) -> HeatMap | None:
     """The one in the run's directory, where a new one would be of the same agent and policy."""
-    file = run.path / "render" / heatmap.FILE
-    if not file.exists():
-        return None
-    heat = heatmap.read(file)
     newest = newest_checkpoint(run.path) or int(run.env_steps[-1])  # a run may be kept without its checkpoints
-    if (heat.env_steps, heat.policy, heat.whole_games) == (newest, "sampled", True):
-        return heat
-    note(f"{file}: left out, as it is not known to be of whole, sampled games at {newest:,} env_steps")
-    return None
+    heat, file = heatmap.of_run(run.path, newest), run.path / "render" / heatmap.FILE
+    if heat is None and file.exists():
+        note(f"{file}: left out, as it is not known to be of whole, sampled games at {newest:,} env_steps")
+    return heat
 
 
 def _make_map(run: RunData, episodes: int) -> HeatMap | None:

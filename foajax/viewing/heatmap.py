@@ -61,6 +61,23 @@ class HeatMap:
         return float(self.counts[y, x][at_bounds].sum() / self.steps)
 
     @property
+    def share_below(self) -> float:
+        """Share of the steps with the focal point in the lower half of the frame, below its middle row."""
+        return float(self.counts[self.counts.shape[0] // 2 + 1 :].sum() / self.steps)
+
+    @property
+    def spread(self) -> float:
+        """Distance from the mean focal point, root mean square, in frame pixels."""
+        return _spread(self.counts)
+
+    @property
+    def relative_spread(self) -> float:
+        """`spread` over that of a gaze that is everywhere within its bounds equally often; 0 where it has no room."""
+        even = np.zeros_like(self.counts)
+        even[self.low[0] : self.high[0] + 1, self.low[1] : self.high[1] + 1] = 1
+        return self.spread / most if (most := _spread(even)) else 0.0
+
+    @property
     def summary(self) -> str:
         """The numbers in one line."""
         games = f"{self.games} game{'s' if self.games > 1 else ''}"
@@ -89,6 +106,13 @@ class HeatMap:
         fields: dict[str, Any] = {key: np.array(record[key]) for key in ("counts", "mean_frame", "low", "high")}
         fields |= {key: record.get(key) for key in ("env_steps", "policy", "whole_games")}
         return cls(games=record["games"], **fields)
+
+
+def _spread(counts: Int[np.ndarray, "H W"]) -> float:
+    points = np.argwhere(counts)
+    weights = counts[counts > 0]
+    mean = np.average(points, axis=0, weights=weights)
+    return float(np.sqrt(np.average(((points - mean) ** 2).sum(axis=1), weights=weights)))
 
 
 def heat_map(recordings: Sequence[Recording]) -> HeatMap:
@@ -120,6 +144,14 @@ def read(file: Path) -> HeatMap:
         return HeatMap.from_json(json.loads(file.read_text()))
     except (OSError, ValueError, KeyError, TypeError):
         raise refuse(str(file), accepted="", why="is no heat map; remove it") from None
+
+
+def of_run(path: Path, env_steps: int) -> HeatMap | None:
+    """What `render` left in a run's directory, where it is of whole games with sampled actions at `env_steps`."""
+    file = path / "render" / FILE
+    heat = read(file) if file.exists() else None
+    said = heat and (heat.env_steps, heat.policy, heat.whole_games)
+    return heat if said == (env_steps, "sampled", True) else None
 
 
 def draw(heat: HeatMap, title: str) -> Figure:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import shlex
 
+import numpy as np
 import pytest
 
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, flatten, to_mapping
 from foajax.reporting import kept
 from foajax.runs.directory import FREE, load_config
+from foajax.viewing import heatmap
+from foajax.viewing.heatmap import HeatMap
 
 RUNS = [path for path in sorted(kept.KEPT.glob("*/*")) if path.is_dir()]
 
@@ -59,7 +62,16 @@ def run(tmp_path, monkeypatch):
         "returns": [9.0] * 100,
     }
     (path / "score.json").write_text(json.dumps(score))
+    watch(path, env_steps=2000)
     return path
+
+
+def watch(path, env_steps):
+    """Leaves a heat map, as `render` does."""
+    bounds = np.array([0, 0]), np.array([4, 4])
+    whose = {"env_steps": env_steps, "policy": "sampled", "whole_games": True}
+    (path / "render").mkdir(exist_ok=True)
+    heatmap.save(HeatMap(np.eye(5, dtype=int), np.zeros((5, 5)), *bounds, games=2, **whose), path / "render", "seek")
 
 
 def test_a_run_is_kept_by_game_experiment_and_seed(run):
@@ -67,10 +79,29 @@ def test_a_run_is_kept_by_game_experiment_and_seed(run):
     assert out == kept.KEPT / "seek" / "seek-s3"
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 500
     assert json.loads((out / "run.json").read_text())["command"] == "python -m foajax.train experiment=seek seed=3"
-    kept.write_tables(kept.KEPT)
+    assert heatmap.of_run(out, 2000).games == 2
+    kept.write_table(kept.KEPT)
     table = (kept.KEPT / "README.md").read_text()
     assert "| seek | `seek` | 3 | 281 | learned | 0.0 M | 0.0 | 9.0 ± 0.5 | [seek/seek-s3](seek/seek-s3) |" in table
-    assert (kept.KEPT / "seek.png").stat().st_size > 1000
+
+
+def test_a_gaze_without_a_heat_map_of_the_final_policy_is_refused(run):
+    watch(run, env_steps=1000)
+    with pytest.raises(
+        ConfigError, match="has no heat map of its final policy in render/; accepted is what render run="
+    ):
+        kept.keep(run, None)
+
+
+def test_numbers_are_kept_to_five_digits(run):
+    row = {"env_steps": 123_456_789, "time": 1.23456789, "score": 0.5, "note": None}
+    assert kept._rounded(row) == row | {"time": 1.2346}
+
+
+def test_a_run_that_is_not_finished_is_refused(run):
+    (run / "checkpoints" / "2000").rename(run / "checkpoints" / "1000")
+    with pytest.raises(ConfigError, match="has 1,000 of its 2,000 env_steps; accepted is a finished run"):
+        kept.keep(run, None)
 
 
 def test_a_score_of_fewer_games_is_refused(run):

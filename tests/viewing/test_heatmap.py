@@ -26,12 +26,16 @@ def test_the_numbers():
     # 1/2 * 1 + 1/4 * 2 + 2 * 1/8 * 3 bits
     assert heat.entropy == pytest.approx(1.75)
     assert heat.share_at_bounds == 2 / 8
+    assert heat.share_below == 1 / 8  # row 3 of 0 to 4
+    # Variances down and across: of the steps 1/4 and 111/64, of rows 1 to 3 and columns 1 to 6 8/12 and 35/12.
+    assert heat.spread == pytest.approx((1 / 4 + 111 / 64) ** 0.5)
+    assert heat.relative_spread == pytest.approx(((1 / 4 + 111 / 64) / (43 / 12)) ** 0.5)
     assert heat.summary == "8 steps of 1 game, 1.75 bits, 25 % at the bounds"
 
 
 def test_a_gaze_that_never_moves_has_no_entropy():
     heat = HeatMap(gaze.count(np.array([[2, 2]] * 9), (5, 5)), np.zeros((5, 5)), np.array([2, 2]), np.array([2, 2]), 1)
-    assert heat.entropy == 0 and heat.share_at_bounds == 1
+    assert heat.entropy == 0 and heat.share_at_bounds == 1 and heat.relative_spread == 0
     heatmap.draw(heat, "still")
 
 

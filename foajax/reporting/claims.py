@@ -1,0 +1,304 @@
+"""The paper's claims, and questions of ours, asked of kept runs: what is seen, and whether it holds.
+
+Each claim says within which bounds a number has to lie: a ratio of two scores, or a share. `judge` has the rules, and
+`RULES` says them in words.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from foajax.reporting.curves import RunData, on_common_axis
+from foajax.reporting.scores import CONFIDENCE, REFERENCE, RESAMPLES, Interval, interval
+from foajax.viewing.heatmap import HeatMap
+
+SEEDS = 3  # of each experiment, for a verdict
+NOT_RUN = "not run yet"
+_CHANCE = ", ".join(f"{low} on {game}" for game, (low, _) in REFERENCE.items() if game != "seek")
+RULES = f"""\
+- A score is the mean of 100 whole games of the final policy, unclipped. Ratios are of what a score has above random
+  play: {_CHANCE}.
+- In brackets: {100 * CONFIDENCE:.0f} % intervals by bootstrap over seeds. With one seed they are over its 100 games and
+  say nothing of what another seed would score. What is read from the curve or the heat map of one seed has none.
+- The interval of a ratio goes from the smallest to the largest ratio of what is in the two intervals. So one score is
+  higher than another only where their intervals do not overlap.
+- A claim *holds* where the whole interval is as claimed, and *does not hold* where none of it is; otherwise the runs
+  *cannot tell*. Where a claim is about two pairs, it has to hold for both.
+- This takes {SEEDS} seeds of each experiment. The interval then goes from the worst to the best seed, and of two equal
+  experiments one in 20 would seem better than the other in the way that is claimed. Fewer seeds only *suggest*."""
+
+
+class Game(NamedTuple):
+    """What is kept of one game, by the experiment's name without `_packed`."""
+
+    name: str
+    runs: Mapping[str, Sequence[RunData]]  # seeds of each
+    heats: Mapping[str, Sequence[HeatMap]] = {}  # of the seeds that have one
+
+
+class Part(NamedTuple):
+    """One number that a claim is about."""
+
+    found: Interval
+    seeds: int  # that it rests on
+    seen: str  # the same in words
+
+
+class Claim(NamedTuple):
+    """What is claimed; it holds where all parts lie between `low` and `high`."""
+
+    title: str
+    says: str | None  # the paper's words; None where the question is ours
+    asks: str  # what is compared, and with which bounds
+    low: float
+    high: float
+    parts: Callable[[Game], list[Part | None]]  # None where a run is missing
+
+
+class Finding(NamedTuple):
+    """What the runs of one game say of a claim."""
+
+    verdict: str
+    seen: list[str]
+
+
+def ask(claim: Claim, game: Game) -> Finding:
+    """What the runs of a game say of a claim."""
+    parts = claim.parts(game)
+    return Finding(judge(parts, claim.low, claim.high), [part.seen for part in parts if part is not None])
+
+
+def judge(parts: Sequence[Part | None], low: float, high: float) -> str:
+    """The verdict; see `RULES`."""
+    there = [part for part in parts if part is not None]
+    if len(there) < len(parts):
+        return NOT_RUN
+    within = all(low < part.found.low and part.found.high < high for part in there)
+    outside = any(part.found.high <= low or high <= part.found.low for part in there)
+    seeds = min(part.seeds for part in there)
+    if seeds >= SEEDS:
+        return "holds" if within else "does not hold" if outside else "cannot tell"
+    who, s = ("one seed", "s") if seeds == 1 else (f"{seeds} seeds", "")
+    return f"{who} suggest{s} yes" if within else f"{who} suggest{s} no" if outside else f"{who} cannot tell"
+
+
+def score(runs: Sequence[RunData]) -> Interval:
+    """The mean score over seeds; its interval is over the games where there is one seed."""
+    if len(runs) == 1:
+        return interval([np.array((runs[0].evaluation or {})["returns"], float)], np.mean)
+    return interval([np.array([run.final_score for run in runs])], np.mean)
+
+
+def training_score(runs: Sequence[RunData], *, share: float) -> Interval:
+    """The mean of the curves over the first `share` of the training, over seeds."""
+    steps = [np.linspace(0, share * run.env_steps[-1], 300) for run in runs]
+    means = [np.interp(x, run.env_steps, run.score).mean() for x, run in zip(steps, runs, strict=True)]
+    return interval([np.array(means)], np.mean)
+
+
+def above_chance(score: Interval, game: str) -> Interval:
+    """What a score has above random play; all of it in a game without a reference."""
+    chance = REFERENCE.get(game, (0.0, 0.0))[0]
+    return Interval(*(each - chance for each in score))
+
+
+def over(a: Interval, b: Interval) -> Interval:
+    """a / b of what is not negative; from the smallest to the largest ratio."""
+    a, b = (Interval(*(max(each, 0.0) for each in given)) for given in (a, b))
+    value, high = (x / y if y > 0 else math.inf for x, y in ((a.value, b.value), (a.high, b.low)))
+    return Interval(value, a.low / b.high if b.high > 0 else 0.0, high)
+
+
+def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) -> Interval | None:
+    """How many times as far along the axis `slow` first has the score that both reach: the lower one at the ends.
+
+    Of mean curves over seeds; the interval is by bootstrap over both. None where a group has no scores in common.
+    """
+    first, second = on_common_axis(slow, axis), on_common_axis(fast, axis)
+    if first is None or second is None:
+        return None
+    (slow_x, slow_curves), (fast_x, fast_curves) = first, second
+
+    def ratio(slow_mean: np.ndarray, fast_mean: np.ndarray) -> Float[np.ndarray, "n"]:
+        level = np.minimum(slow_mean[:, -1:], fast_mean[:, -1:])
+        return slow_x[np.argmax(slow_mean >= level, axis=1)] / fast_x[np.argmax(fast_mean >= level, axis=1)]
+
+    random = np.random.default_rng(0)
+    drawn = [
+        curves[random.integers(0, len(curves), (RESAMPLES, len(curves)))].mean(axis=1)
+        for curves in (slow_curves, fast_curves)
+    ]
+    low, high = np.quantile(ratio(*drawn), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    value = ratio(slow_curves.mean(axis=0, keepdims=True), fast_curves.mean(axis=0, keepdims=True))
+    return Interval(float(value[0]), float(low), float(high))
+
+
+def told(number: Interval) -> str:
+    """A number and its interval, in three digits or whole numbers."""
+    value, low, high = (f"{each:,.0f}" if 1000 <= abs(each) < math.inf else f"{each:.3g}" for each in number)
+    return f"{value} [{low}, {high}]" if low != high else value
+
+
+def _compare(
+    measure: Callable[[Sequence[RunData]], Interval], what: str, pairs: Sequence[tuple[str, str]], game: Game
+) -> list[Part | None]:
+    """A measure of one experiment over that of another, above random play, pair by pair."""
+    parts: list[Part | None] = []
+    for pair in pairs:
+        if not all(name in game.runs for name in pair):
+            parts.append(None)
+            continue
+        a, b = (measure(game.runs[name]) for name in pair)
+        found = over(above_chance(a, game.name), above_chance(b, game.name))
+        seen = f"{what}: `{pair[0]}` {told(a)}, `{pair[1]}` {told(b)}; ratio {told(found)}"
+        parts.append(Part(found, min(len(game.runs[name]) for name in pair), seen))
+    return parts
+
+
+def _scores(*pairs: tuple[str, str]) -> Callable[[Game], list[Part | None]]:
+    return functools.partial(_compare, score, "Score", pairs)
+
+
+def _training(share: float, *pairs: tuple[str, str]) -> Callable[[Game], list[Part | None]]:
+    what = "Mean score in training" if share == 1 else f"Mean score in the first {100 * share:.0f} % of training"
+    return functools.partial(_compare, functools.partial(training_score, share=share), what, pairs)
+
+
+def _longer(slow: str, fast: str) -> Callable[[Game], list[Part | None]]:
+    def parts(game: Game) -> list[Part | None]:
+        if slow not in game.runs or fast not in game.runs:
+            return [None]
+        groups = game.runs[slow], game.runs[fast]
+        steps, hours = (times_longer(*groups, axis) for axis in ("env_steps", "time"))
+        if steps is None or hours is None:
+            return [None]
+        seen = f"`{slow}` takes {told(steps)} times the steps of `{fast}`, and {told(hours)} times the core hours"
+        return [Part(steps, min(map(len, groups)), seen)]
+
+    return parts
+
+
+def _gaze(number: str, what: str) -> Callable[[Game], list[Part | None]]:
+    """A number of the heat maps of the two sensors of the paper's Fig. 10."""
+
+    def part(name: str, heats: Sequence[HeatMap]) -> Part | None:
+        if not heats:
+            return None
+        found = interval([np.array([getattr(heat, number) for heat in heats])], np.mean)
+        return Part(found, len(heats), f"{what}: `{name}` {told(found)}")
+
+    return lambda game: [part(name, game.heats.get(name, ())) for name in WATCHED]
+
+
+WATCHED = ("constant70", "decreasing_p")  # in Fig. 10
+_PERIPHERY = (("constant70_p", "constant70"), ("decreasing_p", "decreasing"))
+
+CLAIMS = (
+    Claim(
+        "Lower resolution at 50x50 hurts",
+        "lowering the resolution for a 50 × 50 focal area deteriorates performance",
+        "Score of `constant50_sub1` over `constant50_sub2`: above 1.",
+        *(1.0, math.inf, _scores(("constant50_sub1", "constant50_sub2"))),
+    ),
+    Claim(
+        "70x70 at half resolution beats 50x50 at full, with half the pixels",
+        "the *Constant 70x70, sub2* model outperforms the *Constant 50x50, sub1* model even though only approximately "
+        "half the amount of pixels are visible to the agent",
+        "Score of `constant70` over `constant50_sub1`: above 1.",
+        *(1.0, math.inf, _scores(("constant70", "constant50_sub1"))),
+    ),
+    Claim(
+        "Decreasing resolution is about equal to constant",
+        "The performances of the two models are quite similar",
+        "Score of `decreasing` over `constant70`: 0.8 to 1.25.",
+        *(0.8, 1.25, _scores(("decreasing", "constant70"))),
+    ),
+    Claim(
+        "The outer ring helps",
+        "the low resolution outer focal area does add valuable information to the model",
+        "Score of `decreasing` over `constant50_sub1`: above 1.",
+        *(1.0, math.inf, _scores(("decreasing", "constant50_sub1"))),
+    ),
+    Claim(
+        "The periphery improves the score",
+        "When the peripheral is added to the two previously mentioned RoI layers the performance is improved.",
+        "Score of `constant70_p` over `constant70`, and of `decreasing_p` over `decreasing`: above 1.",
+        *(1.0, math.inf, _scores(*_PERIPHERY)),
+    ),
+    Claim(
+        "The periphery makes learning faster",
+        "both the *Constant(P) 70x70, sub2* model and the *Decreasing(P) 30-50-70* model are faster to train than "
+        "their counterparts",
+        "Mean score over the whole training, the same pairs: above 1.",
+        *(1.0, math.inf, _training(1.0, *_PERIPHERY)),
+    ),
+    Claim(
+        "A fifth of the pixels is enough",
+        "we can reduce the image data by a factor of 5 while still achieving similar game performance",
+        "Score of `constant70_p` (1241 values) over `nonfoa` (6400): above 0.8.",
+        *(0.8, math.inf, _scores(("constant70_p", "nonfoa"))),
+    ),
+    Claim(
+        "Learning takes about 5 times longer",
+        "The learning of the two policies took approx. 5 times longer",
+        "Steps that `constant70_p` takes over those of `nonfoa`, to the lower of the scores that both end with: 2.5 to "
+        "10.",
+        *(2.5, 10.0, _longer("constant70_p", "nonfoa")),
+    ),
+    Claim(
+        "A gaze slows the first learning",
+        "the addition of the focus-of-attention algorithm generally deteriorates performance, particularly during the "
+        "initial episodes",
+        "Mean score over the first tenth of the training, `constant70` over `nonfoa`: below 1.",
+        *(-math.inf, 1.0, _training(0.1, ("constant70", "nonfoa"))),
+    ),
+    Claim(
+        "The gaze stays in the lower half",
+        "the focal point is mostly kept centered at the bottom half of the screen",
+        "Share of the decisions with the focal point below the middle, `constant70` and `decreasing_p`: above 0.5.",
+        *(0.5, math.inf, _gaze("share_below", "Share below the middle")),
+    ),
+    Claim(
+        "The gaze moves little",
+        "the agent does not move its focal point very much",
+        "Spread of the focal point over that of one which is everywhere within its bounds, `constant70` and "
+        "`decreasing_p`: below 0.5. The bounds are narrow, 11x11 pixels, as the 70x70 window stays inside the frame.",
+        *(-math.inf, 0.5, _gaze("relative_spread", "Relative spread")),
+    ),
+    Claim(
+        "Without gaze control it is much worse",
+        "without the gaze control and only a low-resolution image the performance was much worse",
+        "Score of `constant70_p` with its gaze frozen in the centre over the learned one's: below 0.5.",
+        *(-math.inf, 0.5, _scores(("constant70_p-frozen", "constant70_p"))),
+    ),
+    Claim(
+        "A learned gaze beats a random one",
+        None,
+        "Score of `constant70_p` over that with a random gaze: above 1.",
+        *(1.0, math.inf, _scores(("constant70_p", "constant70_p-random"))),
+    ),
+    Claim(
+        "A learned gaze beats a scripted one",
+        None,
+        "Score of `constant70_p` over that with a gaze that follows a fixed path: above 1.",
+        *(1.0, math.inf, _scores(("constant70_p", "constant70_p-scripted"))),
+    ),
+    Claim(
+        "Packed values score no less than the paper's canvas",
+        None,
+        "Score of `constant70_p` over the same on an 80x80 canvas: above 0.8.",
+        *(0.8, math.inf, _scores(("constant70_p", "constant70_p, canvas"))),
+    ),
+    Claim(
+        "A log-polar retina scores no less than squares of as many values",
+        None,
+        "Score of `logpolar` over `constant70` (1225 values each): above 0.8.",
+        *(0.8, math.inf, _scores(("logpolar", "constant70"))),
+    ),
+)

@@ -1,0 +1,299 @@
+"""docs/results.md and the README's block: figures, tables and the paper's claims, all made from kept runs."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from foajax.config import shipped
+from foajax.config.parse import refuse
+from foajax.reporting import claims
+from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
+from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, read_run
+from foajax.reporting.groups import PRESETS, differing_keys, games_of
+from foajax.sensors.registry import make_sensor
+from foajax.viewing import heatmap
+
+ROOT = shipped.kept_runs().parents[1]
+GAMES = {"breakout": "Breakout", "pong": "Pong", "beam_rider": "Beam Rider"}
+_GAZES = {
+    "nonfoa": "whole frame",
+    "constant70_p": "gaze learned",
+    **{f"constant70_p-{mode}": f"gaze {mode}" for mode in ("frozen", "random", "scripted")},
+}
+FIGURES: dict[str, tuple[str, Mapping[str, str]]] = {  # title, and whose curves by which names
+    "constant": ("constant resolution (Fig. 7)", {name: name for name in PRESETS["constant"]}),
+    "decreasing": ("decreasing resolution (Fig. 8)", {name: name for name in PRESETS["decreasing"]}),
+    "peripheral": ("peripheral vision (Fig. 9)", {name: name for name in PRESETS["peripheral"]}),
+    "gaze": ("the whole frame, and a fifth of it", _GAZES),
+}
+_COMPARED = {*PAPER_NAMES, *_GAZES, "logpolar", "constant70_p, canvas"}
+_AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")}
+BLOCK = re.compile(r"(<!-- results: [^>]*-->\n).*?(<!-- /results -->)", re.DOTALL)
+
+
+def read(directory: Path) -> dict[str, Game]:
+    """Kept runs by game; `time` is in core seconds.
+
+    Raises:
+      ConfigError: runs of a game that are compared differ in more than sensor, gaze and seed.
+    """
+    runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
+    games = {}
+    for name, groups in games_of(runs, None).items() if runs else ():
+        if name not in GAMES:
+            continue
+        labelled = {_label(seeds[0]): [_in_core_time(run) for run in seeds] for seeds in groups.values()}
+        _check_protocol([labelled[each] for each in labelled if each in _COMPARED])
+        heats = {label: list(filter(None, map(_heat, seeds))) for label, seeds in labelled.items()}
+        games[name] = Game(name, labelled, heats)
+    return games
+
+
+def _label(run: RunData) -> str:
+    """The experiment's name without `_packed`; a sensor that could be packed and is not is called a canvas."""
+    name = run.config.name.replace("_packed", "")
+    is_canvas = make_sensor(run.config.sensor).in_place and name != "nonfoa"
+    return f"{name}, canvas" if is_canvas else name
+
+
+def _in_core_time(run: RunData) -> RunData:
+    return run._replace(time=run.time * _facts(run)["cores"])
+
+
+def _facts(run: RunData) -> dict[str, Any]:
+    return json.loads((run.path / "run.json").read_text())
+
+
+def _heat(run: RunData) -> heatmap.HeatMap | None:
+    return heatmap.of_run(run.path, _facts(run)["env_steps"])
+
+
+def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
+    first = [seeds[0] for seeds in groups]
+    for key, values in differing_keys(first).items():
+        if not key.startswith(("sensor.", "gaze.")):
+            other = next(run for run, value in zip(first, values, strict=True) if value != values[0])
+            accepted = f"the same {key} as in {first[0].path}"
+            raise refuse(str(other.path), accepted=accepted, why="is compared with runs of another kind")
+    lengths = {run.config.train.env_steps: run for seeds in groups for run in seeds}
+    for steps, run in list(lengths.items())[1:]:
+        accepted = f"{next(iter(lengths)):,}, as the runs that it is compared with"
+        raise refuse(str(run.path), accepted=accepted, why=f"is of {steps:,} env_steps")
+
+
+def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
+    """The text of docs/results.md.
+
+    Args:
+      games: kept runs, by game.
+      costs: what `foajax cost` measured of each experiment.
+    """
+    findings = {
+        claim.title: {game: claims.ask(claim, games.get(game, Game(game, {}))) for game in GAMES} for claim in CLAIMS
+    }
+    parts = [
+        "# Results",
+        _INTRODUCTION,
+        "## Does the paper hold?",
+        _verdicts([claim for claim in CLAIMS if claim.says], findings, "the paper's claim"),
+        "Questions of ours:",
+        _verdicts([claim for claim in CLAIMS if not claim.says], findings, "question"),
+        "How a verdict is reached:",
+        claims.RULES,
+        "## Claim by claim",
+        *(_section(claim, findings[claim.title]) for claim in CLAIMS),
+        *(_game(games[game], costs) if game in games else f"## {GAMES[game]}\nNot run yet." for game in GAMES),
+        _SENSORS,
+        _protocol([run for game in games.values() for seeds in game.runs.values() for run in seeds]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+_INTRODUCTION = """\
+The paper's seven sensors on its three games, with controls that it does not show. `foajax reproduce` makes the runs.
+`foajax keep` keeps them and writes this page; no figure on it is written by hand.
+[What each sensor is](experiments.md)."""
+
+_SENSORS = """\
+## What the sensors show (Figs. 5 and 6)
+Left the frame with the focal area and the focal point, right what the sensor gives, put back in its place.
+
+![Constant: two places of the gaze](results/constant.png)
+
+![Decreasing(P): two places of the gaze](results/decreasing_p.png)
+
+Drawn by `foajax show sensor=constant70 points=[[35,35],[45,45]] out=docs/results/constant.png`, and the same with
+`decreasing_p`."""
+
+
+_PROTOCOL = """\
+## How the runs were made
+The default learner for 3,000,000 decisions (Pong 1,500,000) of 4 frames each, the packed layout where a sensor has one.
+100 whole games of the final policy, actions sampled, give the score. A point of a curve is the mean of the last 100
+games of training, with no other smoothing; 500 points of each curve are kept. Where there are several seeds, thin lines
+are seeds, the thick line is their mean, and the band its 95 % interval by bootstrap over seeds. Core hours are hours
+times cores; other work on the machine lengthens them. Commands, commits and machines of all runs:
+[results/runs](../results/runs/README.md)."""
+
+
+def _protocol(runs: Sequence[RunData]) -> str:
+    facts = [_facts(run) for run in runs]
+
+    def each(values: Iterable[str]) -> str:
+        return ", ".join(sorted(set(values)))
+
+    text = _PROTOCOL
+    if facts:
+        pythons, cpus = each(fact["python"] for fact in facts), each(fact["cpu"] for fact in facts)
+        text += f"\n\nPython {pythons}, jax {each(fact['packages']['jax'] for fact in facts)}, {cpus}."
+    return text
+
+
+def _verdicts(chosen: Sequence[Claim], findings: Mapping[str, Mapping[str, Finding]], head: str) -> str:
+    rows = [
+        [
+            f"[{claim.title}](#{_anchor(claim.title)})",
+            *(_bold(finding.verdict) for finding in findings[claim.title].values()),
+        ]
+        for claim in chosen
+    ]
+    return table([head, *GAMES.values()], rows)
+
+
+def _bold(verdict: str) -> str:
+    return f"**{verdict}**" if verdict in ("holds", "does not hold") else verdict
+
+
+def _anchor(title: str) -> str:
+    """As GitHub makes them."""
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+
+
+def _section(claim: Claim, findings: Mapping[str, Finding]) -> str:
+    says = f"The paper: “{claim.says}”\n\n" if claim.says else ""
+    seen = [
+        f"- {GAMES[game]}: {_bold(finding.verdict)}. {'. '.join(finding.seen)}."
+        for game, finding in findings.items()
+        if finding.verdict != claims.NOT_RUN
+    ]
+    return f"### {claim.title}\n{says}{claim.asks}\n\n" + ("\n".join(seen) or "Not run yet.")
+
+
+def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
+    name = GAMES[game.name]
+    parts = [f"## {name}", _scores(game, costs)]
+    for file, (title, labels) in FIGURES.items():
+        if any(label in game.runs for label in labels):
+            left = [f"`{label}`" for label in labels if label not in game.runs]
+            parts.append(f"![{name}: {title}](results/{game.name}-{file}.png)")
+            parts += [f"Not run yet: {', '.join(left)}."] if left else []
+    for label in claims.WATCHED:
+        if game.heats.get(label):
+            parts.append(f"![{name}: where {label} looks (Fig. 10)](results/{game.name}-heat-{label}.png)")
+    return "\n\n".join(parts)
+
+
+_COLUMNS = ["agent", "pixel values", "seeds", "score", "of `nonfoa`", "MFLOP", "ms alone", "ms of 32", "core hours"]
+_SCORES = """\
+Score: mean of 100 games [95 %], over seeds or else over the games; of `nonfoa`: the ratio of what is above random play.
+A decision's MFLOP and its time on a CPU, alone and as one of 32 at once: [cost.json](../results/bench/cost.json)."""
+
+
+def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
+    order = [*PAPER_NAMES, *(label for label in game.runs if label not in PAPER_NAMES)]
+    rows = [
+        _row(game, label, costs) if label in game.runs else [f"`{label}`", "", "", claims.NOT_RUN, "", *_cost(None), ""]
+        for label in order
+    ]
+    return f"{table(_COLUMNS, rows)}\n\n{_SCORES}"
+
+
+def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str]:
+    runs, whole = game.runs[label], game.runs.get("nonfoa")
+    config, found = runs[0].config, claims.score(runs)
+    of_whole = whole and claims.over(
+        claims.above_chance(found, game.name), claims.above_chance(claims.score(whole), game.name)
+    )
+    measured = (config.name.split("-")[0], config.network.torso)
+    return [
+        f"`{label}`",
+        f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
+        str(len(runs)),
+        claims.told(found),
+        claims.told(of_whole) if of_whole and label != "nonfoa" else "",
+        *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
+        f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
+    ]
+
+
+def _cost(record: Mapping[str, Any] | None) -> list[str]:
+    if record is None:
+        return ["", "", ""]
+    alone, together = record["decision_us_batch1"] / 1e3, record["decision_us_batch32"] / 32e3
+    return [f"{record['decision_flops'] / 1e6:.1f}", f"{alone:.2f}", f"{together:.2f}"]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str | None:
+    """What the README shows: Breakout, the whole frame and a gaze moved in several ways; None before it was run."""
+    game = games.get("breakout", Game("breakout", {}))
+    there = [label for label in _GAZES if label in game.runs]
+    if there[:3] != list(_GAZES)[:3]:
+        return None
+    rows = [[f"{_GAZES[label]} ({cells[0]})", *cells[1:5]] for label in there for cells in [_row(game, label, costs)]]
+    one = any(len(game.runs[label]) == 1 for label in there)
+    over_what = "over seeds, or over the games where there is one seed" if one else "over seeds"
+    verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
+    counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in dict.fromkeys(verdicts))
+    return (
+        "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
+        f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
+        f"Breakout, 100 whole games, 95 % intervals {over_what}.\n"
+        f"The paper's {len(verdicts)} claims on Breakout: {'; '.join(counts)}. [All results](docs/results.md).\n"
+    )
+
+
+def draw(games: Mapping[str, Game], directory: Path) -> None:
+    """Draws the figures of the page."""
+    for game in games.values():
+        title = GAMES[game.name]
+        for file, (what, labels) in FIGURES.items():
+            if there := {label: shown for label, shown in labels.items() if label in game.runs}:
+                groups = {shown: game.runs[label] for label, shown in there.items()}
+                colours = {there[label]: colour for label, colour in colours_of(there).items()}
+                _save(draw_curves(groups, f"{title}: {what}", colours, _AXES), directory / f"{game.name}-{file}.png")
+        for label in claims.WATCHED:
+            if heats := game.heats.get(label):
+                _save(heatmap.draw(heats[0], f"{label} on {title}"), directory / f"{game.name}-heat-{label}.png")
+
+
+def _save(figure: Figure, file: Path) -> None:
+    """As a PNG of 128 colours, a third of the size."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=120)
+    Image.open(content).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)
+
+
+def write(root: Path = ROOT) -> None:
+    """Makes docs/results.md, its figures and the README's block anew from `results/` of a checkout."""
+    games = read(root / "results" / "runs")
+    costs = json.loads((root / "results" / "bench" / "cost.json").read_text())
+    (root / "docs" / "results").mkdir(exist_ok=True)
+    draw(games, root / "docs" / "results")
+    (root / "docs" / "results.md").write_text(page(games, costs))
+    readme = root / "README.md"
+    if text := block(games, costs):
+        readme.write_text(BLOCK.sub(lambda found: found[1] + text + found[2], readme.read_text()))
