@@ -8,12 +8,13 @@ comma := ,
 STAMP := .venv/.installed-$(subst $(comma),-,$(EXTRAS))
 BIN := .venv/bin
 
-.PHONY: help setup train test test-slow check bench soak profile lock clean
+.PHONY: help setup train test test-slow test-all check docs bench soak profile lock clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make train ARGS='experiment=constant70 game=breakout'   train one agent"
-	@echo "make test | test-slow | check     fast tests | the others | style and types"
+	@echo "make test | test-slow | test-all  fast tests | the others | both"
+	@echo "make check | docs                 style and types | the site, in build/site"
 	@echo "make bench | profile | soak       measure the parts | trace a short run | train for half an hour and watch"
 	@echo "make setup EXTRAS=dev,cuda        (re)install, here for an NVIDIA GPU"
 	@echo "make lock | clean                 renew requirements.lock | remove what was installed"
@@ -39,6 +40,11 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m slow $(TEST_ARGS)
+
+test-all: test test-slow
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -38,6 +38,12 @@ def test_the_page_of_keys_is_what_the_schema_says():
     assert (ROOT / "docs/keys.md").read_text() == page_of_keys(Config) + "\n"
 
 
+def test_promises_name_tests_that_exist():
+    tests = {file.name: file.read_text() for file in (ROOT / "tests").rglob("test_*.py")}
+    named = re.findall(r"(test_\w+\.py)::(test_\w+)", (ROOT / "docs/reliability.md").read_text())
+    assert len(named) > 40 and all(f"def {name}(" in tests[file] for file, name in named)
+
+
 def test_links_lead_somewhere():
     own = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     pages = [*own, *ROOT.glob("*/README.md"), *ROOT.glob("results/*/README.md")]
