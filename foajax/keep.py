@@ -2,7 +2,8 @@
 
 Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
 json=<run>/score.json` has found, and `run.json`: command, commits, seed, machine, hours. Then the tables and the
-learning curves of all kept runs are made anew. Without `run=`, only that.
+learning curves of all kept runs, and the table of measurements in `results/bench/`, are made anew. Without `run=`, only
+that.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import Section, refuse
-from foajax.reporting import kept
+from foajax.reporting import bench, kept
 
 
 class Options(Section):
@@ -33,6 +34,7 @@ def keep(arguments: Sequence[str]) -> None:
     if options.run is not None:
         print(kept.keep(Path(options.run), options.name))
     kept.write_tables()
+    bench.write_table()
 
 
 if __name__ == "__main__":
