@@ -56,7 +56,7 @@ def test_a_command_has_the_keys_that_a_page_gives_it(page, command, words):
         assert sweep.expand(words)
         return
     module = importlib.import_module(f"foajax.{command}")
-    words = [word for word in words if "=" in word and not word.startswith(("env.", "search."))]
+    words = [word for word in words if "=" in word and not word.startswith(("env.", "search.", "sensor."))]
     assert cli.parse(module.Options, words)
 
 
