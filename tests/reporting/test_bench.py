@@ -17,7 +17,7 @@ def test_a_measurement_says_how_it_was_made(file):
     found = json.loads(file.read_text())
     assert list(found) == ["command", "commit", "date", "machine", "results"] and found["results"]
     assert found["command"].startswith("python ") and file.name in found["command"]
-    assert re.fullmatch("[0-9a-f]{7,40}", found["commit"]) and re.fullmatch(r"2026-\d\d-\d\d", found["date"])
+    assert re.fullmatch("[0-9a-f]{7,40}", found["commit"]) and re.fullmatch(r"\d{4}-\d\d-\d\d", found["date"])
     assert found["machine"].keys() >= {"python", "packages", "cpu", "cores"} and found["machine"]["packages"]["jax"]
 
 
