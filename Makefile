@@ -8,15 +8,16 @@ comma := ,
 STAMP := .venv/.installed-$(subst $(comma),-,$(EXTRAS))
 BIN := .venv/bin
 
-.PHONY: help setup train test test-slow check bench soak profile lock clean
+.PHONY: help setup train test test-slow test-all check docs bench soak profile lock release clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make train ARGS='experiment=constant70 game=breakout'   train one agent"
-	@echo "make test | test-slow | check     fast tests | the others | style and types"
+	@echo "make test | test-slow | test-all  fast tests | the others | both"
+	@echo "make check | docs                 style and types | the site, in build/site"
 	@echo "make bench | profile | soak       measure the parts | trace a short run | train for half an hour and watch"
 	@echo "make setup EXTRAS=dev,cuda        (re)install, here for an NVIDIA GPU"
-	@echo "make lock | clean                 renew requirements.lock | remove what was installed"
+	@echo "make lock | release | clean       renew requirements.lock | wheel, sdist, SBOM in dist | remove what was installed"
 
 setup: $(STAMP)
 
@@ -28,7 +29,8 @@ $(BIN)/python:
 	$(PYTHON) -m venv .venv
 
 $(STAMP): pyproject.toml requirements.lock | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[$(EXTRAS)]'
+	sed '/^ *--hash/d; s/ \\$$//' requirements.lock > .venv/constraints.txt # pip cannot hash a checkout
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c .venv/constraints.txt -e '.[$(EXTRAS)]'
 	@touch $@
 
 train: $(STAMP)
@@ -39,6 +41,11 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m slow $(TEST_ARGS)
+
+test-all: test test-slow
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 check: $(STAMP)
 	$(BIN)/ruff check .
@@ -56,8 +63,13 @@ profile: $(STAMP)
 
 lock: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --upgrade --quiet \
+	$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --upgrade --quiet --generate-hashes \
 	  --no-emit-index-url --no-header --output-file requirements.lock pyproject.toml
+
+release: $(STAMP)
+	rm -rf dist && $(BIN)/python -m build --quiet && $(BIN)/twine check --strict dist/*
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check cyclonedx-bom
+	$(BIN)/cyclonedx-py requirements requirements.lock -o dist/sbom.json
 
 clean:
 	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache build dist

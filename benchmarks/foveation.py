@@ -26,6 +26,7 @@ from foajax import cli, runtime
 from foajax.config.compose import compose
 from foajax.config.parse import Section
 from foajax.config.schema import LogPolarSensor, RingSensor, SensorConfig
+from foajax.reporting import bench
 from foajax.sensors.sense import sense
 from foajax.viewing.sheet import PAPER
 
@@ -144,7 +145,7 @@ def main(arguments: Sequence[str]) -> None:
     print("256 frames, constant70 packed, against a loop of OpenCV crop and resize")
     results["opencv_us"] = against_opencv()
     if options.out:
-        cli.write_json("out", options.out, results)
+        bench.write("out", options.out, results, ["python", "benchmarks/foveation.py", *arguments])
 
 
 if __name__ == "__main__":

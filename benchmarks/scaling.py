@@ -42,6 +42,7 @@ from foajax import cli
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, Section, to_mapping
 from foajax.envs.make import make
+from foajax.reporting import bench
 
 SIZES = (100_000, 1_000_000, 10_000_000)  # parameters, float32
 DEVICES = (2, 4, 8)
@@ -251,7 +252,7 @@ def rollout_seconds(a: Assumptions, *, hosts: int, gpus: int, cores: int, envs: 
 
 
 def model() -> dict[str, Any]:
-    """env_steps a second, and the share of each part, for the machines that docs/scaling.md discusses."""
+    """env_steps a second, and the share of each part, for the machines in docs/log/2026-11-25-scaling.md."""
     machines = {
         "1 host, 8 GPUs, 256 cores, 2048 environments": {"hosts": 1, "gpus": 8, "cores": 256, "envs": 2048},
         "1 host, 8 GPUs, 256 cores, 8192 environments": {"hosts": 1, "gpus": 8, "cores": 256, "envs": 8192},
@@ -296,7 +297,7 @@ def main(arguments: Sequence[str]) -> None:
         result["model"] = model()
     print(json.dumps(result, indent=1))
     if options.out:
-        cli.write_json("out", options.out, result)
+        bench.write("out", options.out, result, ["python", "benchmarks/scaling.py", *arguments])
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ from foajax.config.schema import Config
 from foajax.envs.make import make_environments
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_programs, make_state
+from foajax.reporting import bench
 from foajax.runtime import keep_memory, use_compilation_cache
 from foajax.training.collector import Collector, update_on
 
@@ -203,7 +204,7 @@ def main(arguments: Sequence[str]) -> None:
         print(_line(record), flush=True)
     _print(records)
     if options.out:
-        cli.write_json("out", options.out, records)
+        bench.write("out", options.out, records, ["python", "benchmarks/train_speed.py", *arguments])
 
 
 def _line(record: dict[str, Any]) -> str:

@@ -31,6 +31,7 @@ from foajax.config.parse import Section
 from foajax.config.schema import Config, NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.learning.optimizer import make_optimizer
+from foajax.reporting import bench
 from foajax.runtime import keep_memory
 from foajax.types import CoreState, NetworkOutput
 
@@ -289,7 +290,7 @@ def main(arguments: Sequence[str]) -> None:
                 flush=True,
             )
     if options.out:
-        cli.write_json("out", options.out, records)
+        bench.write("out", options.out, records, ["python", "benchmarks/vs_pytorch.py", *arguments])
 
 
 if __name__ == "__main__":

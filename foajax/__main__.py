@@ -9,9 +9,9 @@ import sys
 from foajax.config.parse import refuse
 
 COMMANDS = {
+    "demo": "Lets an agent that is shipped play a game, to be watched in a browser.",
     "train": "Trains one agent, or a sweep of them, or goes on training.",
     "evaluate": "Plays whole games with a trained agent and prints its scores.",
-    "demo": "Lets an agent that is shipped play a game, to be watched in a browser.",
     "player": "Writes one game as a page to play, scrub and study.",
     "render": "Writes whole games as videos, and a heat map of where the agent looked.",
     "show": "Draws what a sensor sees.",
@@ -21,6 +21,7 @@ COMMANDS = {
     "reproduce": "Runs the paper's comparison, stage by stage.",
     "export": "Writes a folder that runs an agent without JAX and foajax.",
     "store": "Makes an agent to be shipped from a run.",
+    "doctor": "Tells what is installed, which devices there are, and what is missing.",
     "keep": "Keeps in results/runs/ what others need to judge and repeat a run.",
 }
 

@@ -28,6 +28,7 @@ from rich.table import Table
 from foajax import cli
 from foajax.config.compose import list_experiments
 from foajax.config.parse import Section, refuse
+from foajax.reporting import bench
 from foajax.reporting.cost import BATCHES, PARTS, REFERENCE, measure
 from foajax.runtime import wait_in_place
 
@@ -58,7 +59,7 @@ def cost(arguments: Sequence[str]) -> None:
         records = measure(names, torso=options.torso, repeats=options.repeats)
         _print(records)
     if options.json_file:
-        cli.write_json("json", options.json_file, records)
+        bench.write("json", options.json_file, records, ["python", "-m", "foajax.cost", *arguments])
 
 
 def _exported(names: Sequence[str], options: Options) -> list[dict[str, Any]]:

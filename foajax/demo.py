@@ -1,6 +1,6 @@
-"""`python -m foajax.demo`: a shipped agent plays one game, with nothing to train, and its page to watch.
+"""`python -m foajax.demo`: a shipped agent plays one game, which is then a page to watch. Nothing is trained.
 
-The best agent in agents/ for the game, by the score that it was shipped with.
+Of the agents for a game, the best one that chooses where to look plays; `agent=` takes another.
 """
 
 from __future__ import annotations
@@ -15,28 +15,37 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import ConfigError, Section, refuse
+from foajax.config.schema import Config
 from foajax.config.shipped import agents
 from foajax.runs.agents import load_agent, load_score
 from foajax.runs.directory import load_config
 from foajax.runtime import use_compilation_cache
+from foajax.sensors.registry import make_sensor
 from foajax.viewing.player_page import write_page
 from foajax.viewing.recording import play, progress_bar
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
+_LOOK_AT = """What to look at:
+  left     the game; the frame on it is where the agent looks
+  middle   all that the agent sees of it
+  right    its two choices: what to do, and where to look next
+  below    the whole game; yellow marks are points. Click to go there, press space to play."""
 
 
 class Options(Section):
     """What the command takes."""
 
     game: str | None = Field(None, description="Game to play; null for breakout, else pong, else any with an agent.")
+    agent: str | None = Field(None, description="A shipped agent's name, or a directory; null for the game's best.")
     out: str = Field("demo", description="Directory of the page.")
     seed: int = Field(0, description="Seed of the game.")
     steps: int = Field(6000, ge=1, description="Decisions at most; 6,000 are seven minutes of an Atari game.")
-    open: bool = Field(False, description="Show the page in the browser.")
+    open: bool | None = Field(None, description="Show the page in the browser; null to be asked on a terminal.")
+    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
 
 def choose(directory: Path, game: str | None) -> Path:
-    """The best agent for a game, by its mean score.
+    """The best agent for a game: one that moves its gaze before others, then by the mean score.
 
     Raises:
       ConfigError: there is none.
@@ -45,30 +54,52 @@ def choose(directory: Path, game: str | None) -> Path:
     for file in sorted(directory.glob("*/config.yaml")):
         shipped.setdefault(load_config(file.parent).game, []).append(file.parent)
     if not shipped:
-        raise ConfigError("demo: no agent is shipped yet; python -m foajax.player run=<dir> shows one of your own")
+        raise ConfigError("demo: no agent is shipped yet; foajax player run=<dir> shows one of your own")
     asked = game or next((name for name in _FIRST if name in shipped), min(shipped))
     if asked not in shipped:
         raise refuse("game", asked, shipped, why="no agent is shipped for it")
-    return max(shipped[asked], key=lambda path: (load_score(path) or {}).get("mean", -math.inf))
+
+    def worth(path: Path) -> tuple[bool, float]:
+        return load_config(path).gaze.mode == "learned", (load_score(path) or {}).get("mean", -math.inf)
+
+    return max(shipped[asked], key=worth)
 
 
 def demo(arguments: Sequence[str]) -> None:
-    """The command; prints the score and the page's path."""
+    """The command; prints what is played, the score, the page's address and what to look at."""
     options = cli.parse(Options, arguments)
-    path = choose(agents(), options.game)
-    stored, directory = load_agent(path), cli.make_directory(options.out)
+    path = Path(options.agent) if options.agent else choose(agents(), options.game)
+    stored, directory = load_agent(path, trust=options.trust), cli.make_directory(options.out)
+    if options.game not in (None, stored.agent.config.game):
+        raise refuse("game", options.game, f"null or {stored.agent.config.game}", why=f"agent={path} plays another")
     use_compilation_cache()
+    print(_introduction(path.name, stored.agent.config))
     with progress_bar() as bar:
         recording = next(play(stored, bar, seed=options.seed, greedy=False, max_steps=options.steps))
-    page = write_page(recording, directory)
-    ended = "game over" if recording.is_over else "cut"
-    print(f"{path.name}: {recording.score[-1]:g} points in {len(recording.score):,} steps ({ended})")
-    if score := load_score(path):
-        error = "" if score["stderr"] is None else f" +- {score['stderr']:.1f}"
-        print(f"its evaluation: {score['mean']:.1f}{error} over {score['episodes']} games ({score['policy']} actions)")
-    print(f"watch it: {page.resolve().as_uri()}")
-    if options.open:
-        webbrowser.open(page.resolve().as_uri())
+    page = write_page(recording, directory).resolve().as_uri()
+    ended = "The game was over" if recording.is_over else "The demo stopped"
+    score = load_score(path)
+    usual = f" Its mean over {score['episodes']} games: {score['mean']:.1f}." if score else ""
+    print(f"{ended} after {len(recording.score):,} decisions. Score: {recording.score[-1]:g}.{usual}")
+    print(f"Watch it: {page}\n{_LOOK_AT}")
+    if _wants(options.open):
+        webbrowser.open(page)
+
+
+def _introduction(name: str, config: Config) -> str:
+    shape = config.env.frame_shape
+    sees = "the whole frame"
+    if config.gaze.mode != "none":
+        values = make_sensor(config.sensor).count(shape).nominal
+        sees = f"{values:,} values of a frame of {shape[0] * shape[1]:,} pixels"
+    chooses = ", and chooses where to look" if config.gaze.mode == "learned" else ""
+    return f"{name} plays {config.game}. It sees {sees}{chooses}."
+
+
+def _wants(said: bool | None) -> bool:
+    if said is None and sys.stdin.isatty() and sys.stdout.isatty():
+        return input("Open it in the browser now? [y/N] ").strip().lower().startswith("y")
+    return bool(said)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
 json=<run>/score.json` has found, the heat map that `render` has left in `<run>/render`, and `run.json`: command,
-commits, seed, machine, hours. Then the table of kept runs, docs/results.md with its figures, and the README's block
-are made anew. Without `run=`, only that.
+commits, seed, machine, hours. Then the table of kept runs, docs/results.md with its figures, the README's block and the
+table of measurements in `results/bench/` are made anew. Without `run=`, only that.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import Section, refuse
-from foajax.reporting import kept, results
+from foajax.reporting import bench, kept, results
 
 
 class Options(Section):
@@ -35,6 +35,7 @@ def keep(arguments: Sequence[str]) -> None:
         print(kept.keep(Path(options.run), options.name))
     kept.write_table()
     results.write()
+    bench.write_table()
 
 
 if __name__ == "__main__":

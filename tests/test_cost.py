@@ -101,7 +101,9 @@ def test_the_saving_is_what_the_readme_says():
 def test_the_command(tmp_path, capsys):
     out = tmp_path / "cost.json"
     assert cli.run(command.cost, ["experiments=constant70_packed", "repeats=3", f"json={out}"]) == 0
-    records = json.loads(out.read_text())
+    found = json.loads(out.read_text())
+    records = found["results"]
+    assert found["command"] == f"python -m foajax.cost experiments=constant70_packed repeats=3 json={out}"
     assert [record["experiment"] for record in records] == ["constant70_packed", "nonfoa"]
     for record in records:
         assert set(record) >= KEYS

@@ -34,13 +34,42 @@ def test_the_best_agent_of_a_game_is_taken(shipped):
     assert demo.choose(shipped, "pong").name == "untold"
 
 
-def test_it_plays(shipped, tmp_path, capsys):
-    assert cli.run(demo.demo, ["steps=40", f"out={tmp_path / 'out'}"]) == 0
+def test_one_that_moves_its_gaze_comes_first(shipped, breakout_agent):
+    config = shipped / "good" / "config.yaml"
+    config.write_text(config.read_text().replace("mode: learned", "mode: frozen"))
+    assert demo.choose(shipped, "breakout").name == "poor"
+
+
+def test_it_plays_and_says_what_to_look_at(shipped, tmp_path, capsys, monkeypatch):
+    opened = []
+    monkeypatch.setattr(demo.webbrowser, "open", opened.append)
+    assert cli.run(demo.demo, ["steps=40", f"out={tmp_path / 'out'}", "open=true"]) == 0
     page = tmp_path / "out" / "index.html"
-    *_, played, evaluated, watch = capsys.readouterr().out.splitlines()
-    assert played.startswith("good: ") and played.endswith(" points in 40 steps (cut)")
-    assert evaluated == "its evaluation: 9.0 +- 0.5 over 30 games (sampled actions)"
-    assert watch == f"watch it: {page.as_uri()}" and page.stat().st_size > 50_000
+    said = capsys.readouterr().out
+    assert said.startswith("good plays breakout. It sees 1,466 values of a frame of 6,400 pixels, and chooses where to")
+    assert "The demo stopped after 40 decisions. Score: " in said and "Its mean over 30 games: 9.0." in said
+    assert f"Watch it: {page.as_uri()}\nWhat to look at:\n" in said and page.stat().st_size > 50_000
+    assert opened == [page.as_uri()]
+
+
+def test_an_agent_is_played_by_its_name(shipped, tmp_path, capsys):
+    assert cli.run(demo.demo, ["steps=2", f"agent={shipped / 'poor'}", f"out={tmp_path / 'out'}"]) == 0
+    assert capsys.readouterr().out.startswith("poor plays breakout.")
+    assert cli.run(demo.demo, ["game=pong", f"agent={shipped / 'poor'}", f"out={tmp_path / 'out'}"]) == 2
+    assert "poor plays another; accepted is null or breakout" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("answer", "wanted"), [("y", True), ("Yes", True), ("", False), ("n", False)])
+def test_on_a_terminal_it_asks(answer, wanted, monkeypatch):
+    monkeypatch.setattr(demo.sys, "stdin", Terminal())
+    monkeypatch.setattr(demo.sys, "stdout", Terminal())
+    monkeypatch.setattr("builtins.input", lambda question: answer)
+    assert demo._wants(None) is wanted
+
+
+class Terminal:
+    def isatty(self):
+        return True
 
 
 @pytest.mark.parametrize(

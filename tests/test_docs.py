@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from foajax import cli
 from foajax.config.schema import Config
 from foajax.config.table import page as page_of_keys
+from foajax.launch import sweep
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = [
@@ -34,8 +39,41 @@ def test_there_are_blocks_and_values():
     assert sum(len(SAID.findall(str(block.values[0]))) for block in BLOCKS) == 12
 
 
+def commands():
+    """Every command line of the guide, without its comment."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for block in re.findall(r"```(?:sh)?\n(.*?)```", page.read_text(), re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                found = re.match(r"(?:foajax |python -m foajax\.)([a-z]+)(?: ([^#]*))?", line)
+                if found and not re.search(r"\.\.\.|<", line):
+                    yield page.name, found[1], shlex.split(found[2] or "")
+
+
+@pytest.mark.parametrize(("page", "command", "words"), list(commands()))
+def test_a_command_has_the_keys_that_a_page_gives_it(page, command, words):
+    if command == "train":
+        words = [word for word in words if word[0] != "-" and not word.startswith("hydra")]
+        assert sweep.expand(words)
+        return
+    module = importlib.import_module(f"foajax.{command}")
+    words = [word for word in words if "=" in word and not word.startswith(("env.", "search.", "sensor."))]
+    assert cli.parse(module.Options, words)
+
+
+def test_the_moving_picture_is_small():
+    assert (ROOT / "docs/breakout.gif").stat().st_size < 3e6
+    with Image.open(ROOT / "docs/breakout.gif") as picture:
+        assert picture.n_frames >= 200
+
+
 def test_the_page_of_keys_is_what_the_schema_says():
     assert (ROOT / "docs/keys.md").read_text() == page_of_keys(Config) + "\n"
+
+
+def test_promises_name_tests_that_exist():
+    tests = {file.name: file.read_text() for file in (ROOT / "tests").rglob("test_*.py")}
+    named = re.findall(r"(test_\w+\.py)::(test_\w+)", (ROOT / "docs/reliability.md").read_text())
+    assert len(named) > 40 and all(f"def {name}(" in tests[file] for file, name in named)
 
 
 def test_links_lead_somewhere():

@@ -11,6 +11,7 @@ import pytest
 from browser import browser_needed, opened_page
 
 from foajax import cli, player
+from foajax.sensors import gaze
 from foajax.sensors.reconstruct import paint, tables
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import player_page
@@ -76,7 +77,7 @@ def numbers_are_what_was_recorded(page, recording):
         shares = page.locator(f"#{head} .row > :last-child").all_inner_texts()
         np.testing.assert_allclose([float(share.rstrip("%")) for share in shares], 100 * probs[77], atol=0.8)
         chosen = page.locator(f"#{head} .row.chosen > :first-child").inner_text()
-        names = recording.actions if head == "natural" else player_page.NAMES
+        names = recording.actions if head == "natural" else gaze.names(recording.config.gaze)
         assert chosen == names[getattr(recording, f"{head}_action")[77]]
         value = float(page.locator(f"#{head}Value").inner_text())
         assert value == pytest.approx(getattr(recording, f"{head}_value")[77], abs=0.006)

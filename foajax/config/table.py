@@ -14,8 +14,9 @@ from foajax.config.parse import ABSENT, Section, describe, kinds, resolve, schem
 _PAGE = """# Keys
 
 Every key of a run, with its default. `python -m foajax.config.table > docs/keys.md` makes this page; the keys stand
-in [schema.py](../foajax/config/schema.py). A group's choice, such as `learner=paper`, changes some of them.
-"""
+in `foajax/config/schema.py`. A group's choice, such as `learner=paper`, changes some of them.
+
+## The run"""
 
 
 class Key(NamedTuple):
@@ -89,16 +90,22 @@ def listed(cls: type[Section]) -> str:
 
 
 def page(cls: type[Section]) -> str:
-    """The keys as a page in Markdown, a table for each section."""
-    lines = [_PAGE]
+    """The keys as a page in Markdown."""
+    return "\n".join([_PAGE, *tables(cls)]).rstrip()
+
+
+def tables(cls: type[Section]) -> list[str]:
+    """Lines of Markdown: a heading and a table for each section."""
+    lines = []
     for group in groups(cls):
-        heading = f"## {group.name}{group.kind and f', kind={group.kind}'}" if group.name else "## The run"
-        lines += [heading, group.sentence, "", "| key | accepted | meaning |", "|---|---|---|"]
+        if group.name:
+            lines.append(f"## {group.name}{group.kind and f', kind={group.kind}'}")
+        lines += [group.sentence, "", "| key | accepted | meaning |", "|---|---|---|"]
         for key in group.keys:
             cells = map(_cell, (f"`{key.word}`", key.accepted, key.sentence))
             lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
-    return "\n".join(lines).rstrip()
+    return lines
 
 
 def _cell(text: str) -> str:

@@ -290,7 +290,7 @@ def _save(figure: Figure, file: Path) -> None:
 def write(root: Path = ROOT) -> None:
     """Makes docs/results.md, its figures and the README's block anew from `results/` of a checkout."""
     games = read(root / "results" / "runs")
-    costs = json.loads((root / "results" / "bench" / "cost.json").read_text())
+    costs = json.loads((root / "results" / "bench" / "cost.json").read_text())["results"]
     (root / "docs" / "results").mkdir(exist_ok=True)
     draw(games, root / "docs" / "results")
     (root / "docs" / "results.md").write_text(page(games, costs))

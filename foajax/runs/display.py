@@ -1,4 +1,4 @@
-"""A run on the terminal: drawn in place on one, a line at a time elsewhere."""
+"""A run on the terminal: all metrics drawn in place on one, a short line at a time elsewhere."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rich.text import Text
 
 Record = Mapping[str, int | float | None]
 
+_IN_A_LINE = {"score": "score", "best_score": "best"}  # the rest is in metrics.jsonl
 _COLUMNS = 3  # of values, side by side
 _SPEED_ROWS = 10  # rows that the shown speed is averaged over
 
@@ -26,13 +27,11 @@ class Display:
     Args:
       total_env_steps: where the run ends.
       start: ``env_steps`` and seconds at which this process takes the run up.
-      frame_skip: emulator frames an agent step.
       live: whether to draw in place; None does so where stdout is a terminal.
     """
 
-    def __init__(self, *, total_env_steps: int, start: tuple[int, float], frame_skip: int, live: bool | None) -> None:
+    def __init__(self, *, total_env_steps: int, start: tuple[int, float], live: bool | None) -> None:
         self._total = total_env_steps
-        self._frame_skip = frame_skip
         self._past = deque([start], maxlen=_SPEED_ROWS + 1)
         console = Console(force_terminal=live, highlight=False)
         wanted = sys.stdout.isatty() and not console.is_dumb_terminal if live is None else live
@@ -41,10 +40,11 @@ class Display:
     def show(self, record: Record) -> None:
         """Shows a row: ``env_steps``, ``time`` in seconds, and any further values."""
         progress = self._progress(record)
-        values = {name: _number(value) for name, value in record.items() if name not in ("env_steps", "time")}
         if self._live is None:
-            self.message(", ".join([progress, *(f"{name} {value}" for name, value in values.items())]))
+            scores = [f"{word} {_number(record[name])}" for name, word in _IN_A_LINE.items() if name in record]
+            self.message(", ".join([progress, *scores]))
             return
+        values = {name: _number(value) for name, value in record.items() if name not in ("env_steps", "time")}
         done = min(int(record["env_steps"] or 0), self._total)
         bar = Table.grid(expand=True)  # a bar alone does not end its line
         bar.add_row(ProgressBar(total=self._total, completed=done))
@@ -73,7 +73,7 @@ class Display:
         speed = (env_steps - first_steps) / max(seconds - first_seconds, 1e-3)
         share = 100 * env_steps / self._total
         words = [f"env_steps {env_steps:,} of {self._total:,} ({share:.1f}%)"]
-        words += [f"frames {env_steps * self._frame_skip:,}", f"{speed:,.0f} steps/s"]
+        words.append(f"{speed:,.0f} steps/s")
         if speed > 0:
             left = datetime.timedelta(seconds=round(max(self._total - env_steps, 0) / speed))
             words.append(f"{left} left")

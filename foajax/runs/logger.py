@@ -41,7 +41,6 @@ class Logger:
       total_env_steps: where the run ends.
       start_env_steps: where this start takes it up. Rows beyond it belong to work that will be done again
         and are removed, as are torn ones.
-      frame_skip: emulator frames an agent step, for the terminal.
       live: whether to draw in place; None does so where stdout is a terminal.
 
     Raises:
@@ -54,7 +53,6 @@ class Logger:
         *,
         total_env_steps: int,
         start_env_steps: int,
-        frame_skip: int = 4,
         live: bool | None = None,
     ) -> None:
         directory = Path(run_dir)
@@ -66,7 +64,6 @@ class Logger:
         self._display = Display(
             total_env_steps=total_env_steps,
             start=(start_env_steps, self._metrics.seconds),
-            frame_skip=frame_skip,
             live=live,
         )
 

@@ -49,14 +49,21 @@ def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str,
         "command": list(command),
         "directory": os.getcwd(),
         "commit": commit(),
-        "python": platform.python_version(),
-        "packages": {name: version(name) for name in _PACKAGES},
         "host": socket.gethostname(),
         "process": os.getpid(),
+        **machine(),
+        "devices": list(devices),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What decides how fast a program runs here, and how it rounds."""
+    return {
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in _PACKAGES},
         "system": platform.platform(),
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "devices": list(devices),
     }
 
 

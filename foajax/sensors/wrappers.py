@@ -98,8 +98,9 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
 
     Args:
       env: as in `FoveatedObservation`; its episodes restart on the next step or not by themselves.
-      sensor, gaze: as in `FoveatedObservation`. Random starts are drawn from a generator of the
-        wrapper's own, seeded by `reset(seed=)`.
+      sensor: as in `FoveatedObservation`.
+      gaze: as in `FoveatedObservation`. Random starts are drawn from a generator of the wrapper's own, seeded by
+        `reset(seed=)`.
 
     Raises:
       ConfigError: as in `FoveatedObservation`, or episodes that restart on the step that ends them.

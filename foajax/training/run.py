@@ -12,7 +12,6 @@ import numpy as np
 
 from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
-from foajax.envs.atari import is_atari
 from foajax.envs.base import Environment
 from foajax.envs.make import make_environments
 from foajax.launch.processes import Job, Watch
@@ -93,10 +92,7 @@ class Run:
             self._journal.write_to(None)
             return None
         save_facts(self._agent, run_dir.path)
-        frame_skip = config.env.frame_skip if is_atari(config) else 1
-        logger = Logger(
-            run_dir.path, total_env_steps=config.train.env_steps, start_env_steps=env_steps, frame_skip=frame_skip
-        )
+        logger = Logger(run_dir.path, total_env_steps=config.train.env_steps, start_env_steps=env_steps)
         self._journal.write_to(resources.enter_context(logger))
         resources.enter_context(self._saving.checkpoints)
         self._journal.say(f"{run_dir.path}: {self._how_it_starts()}")

@@ -20,7 +20,7 @@ def test_a_record_for_each_experiment(tmp_path, capsys):
     words = ["target=onnx", "experiments=constant50_sub2_packed", "repeats=3", f"json={file}", "dtype=float16"]
     assert cli.run(cost.cost, words) == 0
     assert "energy est." in capsys.readouterr().out
-    small, whole = json.loads(file.read_text())
+    small, whole = json.loads(file.read_text())["results"]
     assert (small["experiment"], whole["experiment"]) == ("constant50_sub2_packed", "nonfoa")
     for record in (small, whole):
         assert record["dtype"] == "float16"

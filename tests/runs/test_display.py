@@ -18,24 +18,22 @@ from foajax.runs.display import Display
 
 ROOT = Path(__file__).parents[2]
 ROWS = (
-    {"env_steps": 1_000_000, "time": 900.0, "score": 1.5, "natural_entropy": 1.25, "games": 12345},
+    {"env_steps": 1_000_000, "time": 900.0, "score": 1.5, "best_score": 2.5, "natural_entropy": 1.25, "games": 12345},
     {"env_steps": 2_500_000, "time": 1900.0, "score": None, "natural_entropy": 1e-7, "games": 12346},
 )
 # Hand-computed: 1,500,000 steps in 1000 s, and from the start 2,000,000 in 1500 s.
 LINES = [
-    "env_steps 1,000,000 of 5,000,000 (20.0%), frames 4,000,000, 1,250 steps/s, 0:53:20 left, "
-    "score 1.5, natural_entropy 1.25, games 12,345",
-    "env_steps 2,500,000 of 5,000,000 (50.0%), frames 10,000,000, 1,429 steps/s, 0:29:10 left, "
-    "score -, natural_entropy 1e-07, games 12,346",
+    "env_steps 1,000,000 of 5,000,000 (20.0%), 1,250 steps/s, 0:53:20 left, score 1.5, best 2.5",
+    "env_steps 2,500,000 of 5,000,000 (50.0%), 1,429 steps/s, 0:29:10 left, score -",
 ]
 
 
 def make(**options: object) -> Display:
     start = {"start": (500_000, 500.0)}
-    return Display(**{"total_env_steps": 5_000_000, "frame_skip": 4, "live": None} | start | options)
+    return Display(**{"total_env_steps": 5_000_000, "live": None} | start | options)
 
 
-def test_a_line_a_row_where_there_is_no_terminal(capsys):
+def test_a_short_line_a_row_where_there_is_no_terminal(capsys):
     display = make()
     for row in ROWS:
         display.show(row)
@@ -61,12 +59,12 @@ def test_at_the_end_and_beyond_nothing_is_left(capsys):
 
 def test_no_speed_yet_no_time_left(capsys):
     make().show({"env_steps": 500_000, "time": 500.0})
-    assert capsys.readouterr().out == "env_steps 500,000 of 5,000,000 (10.0%), frames 2,000,000, 0 steps/s\n"
+    assert capsys.readouterr().out == "env_steps 500,000 of 5,000,000 (10.0%), 0 steps/s\n"
 
 
 _SHOW = f"""
 from foajax.runs.display import Display
-display = Display(total_env_steps=5_000_000, start=(500_000, 500.0), frame_skip=4, live=None)
+display = Display(total_env_steps=5_000_000, start=(500_000, 500.0), live=None)
 for row in {ROWS!r}:
     display.message("a [bold]message")
     display.show(row)

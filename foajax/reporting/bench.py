@@ -1,0 +1,40 @@
+"""Measurements that are kept in `results/bench/`: how a file is written, and the table of all."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from foajax import cli
+from foajax.config import shipped
+from foajax.runs.provenance import commit, machine
+
+BENCH = shipped.kept_runs().parent / "bench"
+_INTRO = """# Measurements
+Each file has its command, commit, machine and date, and under `results` what the command found. Made by `foajax keep`.
+"""
+
+
+def write(key: str, path: str, results: Any, command: Sequence[str]) -> None:
+    """Writes what `command` has found, with all that is needed to judge and repeat it."""
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    about = {"command": shlex.join(command), "commit": commit(), "date": today, "machine": machine()}
+    cli.write_json(key, path, {**about, "results": results})
+
+
+def write_table(directory: Path = BENCH) -> None:
+    """Makes the table of all measurements anew."""
+    lines = ["| file | date | commit | machine | command |", "|---|---|---|---|---|"]
+    for file in sorted(directory.glob("*.json")):
+        found = json.loads(file.read_text())
+        where = found["machine"]
+        note = f", {where['note']}" if "note" in where else ""
+        lines.append(
+            f"| [{file.stem}]({file.name}) | {found['date']} | {found['commit'][:7]} "
+            f"| {where['cores']} cores, {where['cpu']}{note} | `{found['command']}` |"
+        )
+    (directory / "README.md").write_text("\n".join([_INTRO, *lines, ""]))
