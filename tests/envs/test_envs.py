@@ -221,9 +221,9 @@ def test_games_go_by_either_name():
         ("probe:mach", {}, r"game=probe:mach: .*probe:match, .*; near: probe:match"),
         ("pong", {"frame_shape": (84, 84)}, r"env.frame_shape=\[84, 84\]: accepted is \[80, 80\] for game=pong"),
         ("pong", {"crop_top": {"default": 34, "pnog": 20}}, r"env.crop_top.pnog=20: accepted is default or an Atari"),
-        ("gymnasium:Nowhere-v0", {}, r"game=gymnasium:Nowhere-v0: accepted is the id of an environment \(.*Nowhere"),
-        ("gymnasium:no_such_module:X-v0", {}, r"game=gymnasium:no_such_module:X-v0: accepted is the id"),
-        ("gymnasium:Sized-v0", {}, r"game=gymnasium:Sized-v0: accepted is the id of an environment \(.*'shape'"),
+        ("gymnasium:Nowhere-v0", {}, r"game=gymnasium:Nowhere-v0: .*Nowhere.*accepted is the id of an environment"),
+        ("gymnasium:no_such_module:X-v0", {}, r"game=gymnasium:no_such_module:X-v0: No module .*pip install no_such_module"),
+        ("gymnasium:Sized-v0", {}, r"game=gymnasium:Sized-v0: .*'shape'.*accepted is the id of an environment"),
         ("gymnasium:CartPole-v1", {}, r"game=gymnasium:CartPole-v1: accepted is .* uint8 images .*, not Box"),
     ],
 )
