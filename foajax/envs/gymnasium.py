@@ -50,8 +50,8 @@ class GymnasiumEnvironment:
             self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
             accepted = "the id of an environment, or gymnasium:<module>:<id> with the module that registers it"
-            missing = error.name if isinstance(error, ModuleNotFoundError) else None
-            why = one_line(error) + (f" (pip install {missing})" if missing else "")
+            missing = getattr(error.__cause__ or error, "name", None) if isinstance(error, ImportError) else None
+            why = f"{missing} is missing (pip install {missing})" if missing else one_line(error)
             raise refuse("game", config.game, accepted, why=why) from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FrameStackObservation
+from noise import Noise
 
 import foajax
 from foajax.config.parse import ConfigError
@@ -26,29 +27,6 @@ FULL = RingSensor(rings=((6, 6, 1),), layout="packed")
 GAZE = GazeConfig(step=2)
 STAY, UP, DOWN, LEFT, RIGHT = range(5)
 LENGTHS = (2, 4)
-
-
-class Noise(gymnasium.Env):
-    """Frames of noise, drawn anew each step; an episode lasts `length` steps."""
-
-    def __init__(self, space=None, action_space=None, length=99):
-        self.observation_space = space or spaces.Box(0, 255, (16, 20), np.uint8)
-        self.action_space = action_space or spaces.Discrete(3)
-        self.length = length
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.observation_space.seed(int(self.np_random.integers(2**31)))
-        self.time = 0
-        return self.draw(), {}
-
-    def step(self, action):
-        self.time, self.action = self.time + 1, action
-        return self.draw(), 1.0, self.time >= self.length, False, {"time": self.time}
-
-    def draw(self):
-        self.drawn = self.observation_space.sample()
-        return self.drawn
 
 
 def wrapped(space=None, sensor=FULL, gaze=GAZE, action_space=None, length=99, **options):
@@ -370,6 +348,7 @@ def test_jax_in_a_forked_process_is_refused_in_one_line():
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
 def test_the_vector_environment_of_ale_py(mode):
+    """Its final observations are one array, and there is no `final_info`: Arcade-Learning-Environment pull 614."""
     vector_env = pytest.importorskip("ale_py.vector_env")
     options = {"stack_num": 2, "max_num_frames_per_episode": 40, "autoreset_mode": AutoresetMode[mode.upper()]}
     env = foajax.FoveatedVectorObservation(vector_env.AtariVectorEnv("breakout", 2, **options), "constant70_packed")
