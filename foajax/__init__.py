@@ -21,7 +21,6 @@ __all__ = [
     "TrainedAgent",
     "compose",
     "load_agent",
-    "numpy",
     "picture",
     "sense",
     "train_agent",
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from foajax.config.schema import Config, GazeConfig, LogPolarSensor, RingSensor
     from foajax.learning.agent import Agent
     from foajax.runs.agents import TrainedAgent, load_agent
-    from foajax.sensors import numpy
+    from foajax.sensors import numpy as numpy
     from foajax.sensors.base import Sensor
     from foajax.sensors.compiled import picture, sense
     from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
@@ -53,7 +52,7 @@ else:
 
     def __getattr__(name: str) -> Any:
         """Fetches a public name on first use, so that `import foajax` does not wait for JAX."""
-        if name == "numpy":
+        if name == "numpy":  # not in __all__, so that `from foajax import *` leaves NumPy alone
             return importlib.import_module("foajax.sensors.numpy")
         for home, names in _HOMES.items():
             if name in names:

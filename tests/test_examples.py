@@ -93,14 +93,24 @@ def test_a_mujoco_task_is_seen_by_its_camera(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_car_racing_trains_with_our_learner(tmp_path):
-    pytest.importorskip("Box2D", reason="pip install 'gymnasium[box2d]'")
+@pytest.mark.parametrize(
+    ("needs", "words", "num_actions"),
+    [
+        ("Box2D", ["game=gymnasium:CarRacing-v3", "env.kwargs.continuous=false"], 5),
+        ("minigrid", ["game=gymnasium:pixels:MiniGrid", "env.kwargs.task=MiniGrid-Empty-5x5-v0"], 7),
+        ("imageio", ["game=gymnasium:pixels:Camera", "env.kwargs.task=InvertedPendulum-v5"], 3),
+    ],
+)
+def test_our_learner_trains_in_other_libraries_environments(needs, words, num_actions, tmp_path, monkeypatch):
+    pytest.importorskip(needs, reason=f"{needs} is missing")
     import foajax
 
-    words = ["game=gymnasium:CarRacing-v3", "env.kwargs.continuous=false", "experiment=constant50_sub2_packed"]
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "egl"))
     small = ["env.num_envs=2", "learner.num_minibatches=1", "learner.rollout_length=8", "train.env_steps=16"]
-    agent = foajax.train_agent(foajax.compose([*words, *small, f"run={tmp_path}/run"]))
-    assert agent.env_steps == 16 and agent.agent.num_actions == 5
+    words = [*words, *small, "experiment=constant50_sub2_packed", f"run={tmp_path}/run"]
+    agent = foajax.train_agent(foajax.compose(words))
+    assert agent.env_steps == 16 and agent.agent.num_actions == num_actions
 
 
 @pytest.mark.filterwarnings("ignore")

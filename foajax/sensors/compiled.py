@@ -5,6 +5,8 @@ They may be called inside of `jax.jit`, `jax.vmap` and `jax.grad` too.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Num
@@ -18,12 +20,6 @@ from foajax.sensors.registry import make_sensor
 from foajax.types import HostArray
 
 _sense = jax.jit(pure.sense, static_argnames=("sensor", "bounds"))
-_sense_many = jax.jit(
-    lambda frames, focal_points, sensor, bounds: jax.vmap(
-        lambda frame, point: pure.sense(frame, point, sensor=sensor, bounds=bounds)
-    )(frames, focal_points),
-    static_argnames=("sensor", "bounds"),
-)
 _picture = jax.jit(pure.picture, static_argnames=("sensor", "frame_shape"))
 
 
@@ -61,7 +57,7 @@ def sense_many(
 ) -> tuple[Float[Array, "B _ _ C"], ...]:
     """`sense` for a batch of frames, each with a focal point of its own."""
     refuse_fork()
-    return _sense_many(frames, focal_points, sensor=sensor, bounds=bounds)
+    return jax.vmap(functools.partial(_sense, sensor=sensor, bounds=bounds))(frames, focal_points)
 
 
 def picture(

@@ -97,7 +97,7 @@ def price(before: Int[Any, "*n 2"], after: Int[Any, "*n 2"], *, gaze: GazeConfig
 def saccade(before: Int[Any, "*n 2"], after: Int[Any, "*n 2"]) -> Float[Any, "*n"]:
     """How far the focal point moved: the Euclidean distance, frame pixels."""
     moved = (after - before).astype(np.float32)
-    return (moved * moved).sum(-1) ** 0.5
+    return moved.__array_namespace__().sqrt((moved * moved).sum(-1))
 
 
 def start(random: Any, *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Any, "2"]:

@@ -157,7 +157,7 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
         return self._eye.look(observation), info | self._facts()
 
     def step(self, actions: Any) -> tuple[dict, Any, Any, Any, dict]:
-        """A step of each. On the next step or not at all: the one that begins an episode ignores its action."""
+        """A step of each. Where episodes restart on the next step, that step ignores its action."""
         natural, vision = split(self._form, actions, self._own, self._eye.num_vision, (self.num_envs,))
         observation, reward, terminated, truncated, info = self.env.step(natural)
         self._eye.begin(self._ended, self._random)
@@ -166,6 +166,7 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
         if self._mode == AutoresetMode.SAME_STEP and ended.any():
             info = {**info, "final_obs": self._final(info["final_obs"], ended)}
             info["final_info"] = {**info.get("final_info", {}), **self._facts(ended)}
+            info |= {"_final_obs": ended.copy(), "_final_info": ended.copy()}
             self._eye.begin(ended, self._random)
         self._ended = ended & (self._mode == AutoresetMode.NEXT_STEP)
         reward = reward - due if due.any() else reward

@@ -362,7 +362,7 @@ def test_the_vector_environment_of_ale_py(mode):
         over = terminated | truncated
         ended |= over.any()
         if over.any() and mode == "same_step":
-            assert all((info["final_obs"][i] is not None) == over[i] for i in range(2))
+            assert all((info["final_obs"][i] is not None) == over[i] == info["_final_obs"][i] for i in range(2))
     assert ended
     env.close()
 
