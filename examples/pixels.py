@@ -24,10 +24,10 @@ def minigrid(task: str = "MiniGrid-Empty-8x8-v0", tile_size: int = 10, **kwargs)
 
 
 def camera(task: str = "InvertedPendulum-v5", size: int = 84, levels: int = 3, **kwargs) -> gymnasium.Env:
-    """A MuJoCo task as its camera sees it; `pip install mujoco`. An action drives one joint and leaves the others at 0.
+    """A MuJoCo task as its camera sees it; `pip install "gymnasium[mujoco]"`.
 
-    Actions 0 .. joints * levels - 1 give a joint one of `levels` forces, from its least to its greatest. Without a
-    screen set MUJOCO_GL=egl, or osmesa.
+    An action drives one joint and leaves the others at 0. Actions 0 .. joints * levels - 1 give a joint one of `levels`
+    forces, from its least to its greatest. Without a screen set MUJOCO_GL=egl, or osmesa.
     """
     env = AddRenderObservation(gymnasium.make(task, render_mode="rgb_array", width=size, height=size, **kwargs))
     low, high = env.action_space.low, env.action_space.high
