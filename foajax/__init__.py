@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import foajax.runtime  # noqa: F401  it notices forks
+
 __version__ = "1.0.0"
 __all__ = [
     "Agent",
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from foajax.config.schema import Config, GazeConfig, LogPolarSensor, RingSensor
     from foajax.learning.agent import Agent
     from foajax.runs.agents import TrainedAgent, load_agent
+    from foajax.sensors import numpy as numpy
     from foajax.sensors.base import Sensor
     from foajax.sensors.compiled import picture, sense
     from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
@@ -49,6 +52,8 @@ else:
 
     def __getattr__(name: str) -> Any:
         """Fetches a public name on first use, so that `import foajax` does not wait for JAX."""
+        if name == "numpy":  # not in __all__, so that `from foajax import *` leaves NumPy alone
+            return importlib.import_module("foajax.sensors.numpy")
         for home, names in _HOMES.items():
             if name in names:
                 return getattr(importlib.import_module(f"foajax.{home}"), name)

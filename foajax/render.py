@@ -20,7 +20,7 @@ from foajax.runs.agents import load_agent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing import heatmap
 from foajax.viewing.recording import play, progress_bar
-from foajax.viewing.video import has_ffmpeg, write_video
+from foajax.viewing.video import why_no_mp4, write_video
 
 
 class Options(Section):
@@ -37,8 +37,8 @@ class Options(Section):
     trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
     def check(self) -> None:
-        if self.format == "mp4" and not has_ffmpeg():
-            raise refuse("format", "mp4", "gif where imageio-ffmpeg is missing (pip install -e '.[video]')")
+        if self.format == "mp4" and (why := why_no_mp4()):
+            raise refuse("format", "mp4", "gif", why=why)
 
 
 def render(arguments: Sequence[str]) -> None:
@@ -47,7 +47,7 @@ def render(arguments: Sequence[str]) -> None:
     use_compilation_cache()
     stored = load_agent(options.run, trust=options.trust)
     directory = cli.make_directory(options.out or Path(options.run) / "render")
-    suffix = options.format or ("mp4" if has_ffmpeg() else "gif")
+    suffix = options.format or ("gif" if why_no_mp4() else "mp4")
     recordings, written = [], []
     with progress_bar() as bar:
         greedy = options.policy == "greedy"

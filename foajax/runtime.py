@@ -9,6 +9,26 @@ import ctypes
 import os
 import sys
 
+_forked = False  # whether this process is the fork of one that had JAX
+
+
+def _mark_fork() -> None:
+    global _forked
+    _forked = _forked or "jax" in sys.modules
+
+
+os.register_at_fork(after_in_child=_mark_fork)
+
+
+def refuse_fork() -> None:
+    """`RuntimeError` where JAX would hang: its threads do not survive a fork."""
+    if _forked:
+        raise RuntimeError(
+            "JAX in a forked process: accepted is multiprocessing with 'spawn' or 'forkserver',"
+            " or NumPy, foajax.numpy, with a RingSensor or a LogPolarSensor"
+        )
+
+
 # Parameters of glibc's mallopt (malloc.h).
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
 

@@ -52,7 +52,19 @@ def test_there_is_no_cycle_and_a_command_line_is_read_without_jax():
     assert not {"jax", "numpy", "hydra", "omegaconf"} & set(loaded)
 
 
-COMPILE = {"foajax.learning.programs", "foajax.sensors.compiled", "foajax.sensors.wrappers"}
+WITHOUT_JAX = {
+    f"foajax.sensors.{name}" for name in ("actions", "eye", "gaze", "geometry", "numpy", "pixels", "wrappers")
+}
+
+
+def test_wrappers_need_no_jax():
+    """No module of JAX's at the top of these, nor of what they import; inside of functions there may be."""
+    code = f"import sys, {', '.join(sorted(WITHOUT_JAX))}\nprint(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT)
+    assert not {"jax", "flax", "envpool"} & set(loaded.stdout.split())
+
+
+COMPILE = {"foajax.learning.programs", "foajax.sensors.compiled"}
 
 
 @pytest.mark.parametrize("name", sorted(PURE - COMPILE))

@@ -14,6 +14,7 @@ from foajax.viewing import video
 from foajax.viewing.recording import Screens, progress_bar
 from foajax.viewing.scene import _MARGIN, _TOP, Scene, _dim
 from foajax.viewing.style import NATURAL, RINGS
+from foajax.viewing.video import why_no_mp4
 
 
 def rgb(colour):
@@ -55,6 +56,18 @@ def test_a_whole_frame_without_a_gaze_of_its_own_is_drawn(recording):
     rows, columns = np.nonzero(view[..., 0])
     # The whole frame is shown around its centre; the brightest value is white.
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (160, 163, 80, 83) and view.max() == 255
+
+
+def test_an_ffmpeg_that_does_not_run_is_found_before_the_game_is_played(monkeypatch, capsys):
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg (extra `video`) is not installed")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
+    why_no_mp4.cache_clear()
+    assert cli.run(render.render, ["run=pong-constant70_packed", "format=mp4"]) == 2
+    said = capsys.readouterr().err
+    assert "format=mp4: the ffmpeg of imageio-ffmpeg does not run" in said and "accepted is gif" in said
+    assert said.count("\n") == 1
+    monkeypatch.undo()
+    why_no_mp4.cache_clear()
 
 
 def test_the_command_writes_an_mp4_at_the_games_speed(breakout_agent, tmp_path, capsys):

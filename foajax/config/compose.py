@@ -13,7 +13,16 @@ from typing import Any, cast
 import yaml
 
 from foajax.config.parse import Section, one_line, refuse
-from foajax.config.schema import RENAMED, Config, LogPolarSensor, OwnSensor, RingSensor, from_mapping, renamed
+from foajax.config.schema import (
+    RENAMED,
+    Config,
+    LogPolarSensor,
+    OwnSensor,
+    RingSensor,
+    from_mapping,
+    game_name,
+    renamed,
+)
 from foajax.config.shipped import experiments
 from foajax.config.table import defaults
 
@@ -92,6 +101,8 @@ def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> 
     elif key in offered and value not in offered[key]:
         raise refuse(one_line(word), accepted=offered[key], near=str(value))
     # With ++ an unknown key reaches `from_mapping`, which can say which keys there are.
+    if key == "game":
+        text = ",".join(game_name(name) for name in text.split(","))  # several of a sweep
     for old, new in RENAMED.items():
         text = text.replace(f"${{{old}}}", f"${{{new}}}")
     return f"{key}={text}" if key in offered else f"++{RENAMED.get(key, key)}={text}"

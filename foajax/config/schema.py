@@ -11,7 +11,7 @@ import re
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, field_validator
 
 from foajax.config.parse import CODE, Section, build, file_name, refuse
 
@@ -420,6 +420,11 @@ class Config(Section):
             keys = "learner.rollout_length, num_minibatches, num_epochs and env.num_envs"
             raise refuse("train.env_steps", self.train.env_steps, f"at most {most * rollout} with these {keys}")
 
+    @field_validator("game")
+    @classmethod
+    def _one_name(cls, game: str) -> str:
+        return game_name(game)
+
     @property
     def code(self) -> list[str]:
         """What of it names code outside of foajax, which runs where the part is made."""
@@ -436,6 +441,15 @@ class Config(Section):
     def run_dir(self) -> str:
         """Where the run's files are."""
         return self.run or f"runs/{file_name(self.game)}-{self.name}-s{self.seed}"
+
+
+def game_name(game: str) -> str:
+    """The snake-case name of an Atari game that has a name of Gymnasium's or EnvPool's; any other name as it is.
+
+    SpaceInvaders, ALE/SpaceInvaders-v5, SpaceInvadersNoFrameskip-v4 and SpaceInvaders-v5 are space_invaders.
+    """
+    found = re.fullmatch(r"(?:ALE/)?([A-Z][A-Za-z0-9]*?)(?:NoFrameskip|Deterministic)?(?:-v\d+)?", game)
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", found[1]).lower() if found else game
 
 
 def check_window(config: Config, window: tuple[int, int]) -> None:

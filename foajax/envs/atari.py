@@ -12,7 +12,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 
 from foajax.config.parse import refuse
-from foajax.config.schema import Config
+from foajax.config.schema import Config, game_name
 from foajax.envs.own import OWN
 
 FRAME_SHAPE = (80, 80)  # of what `frames.crop_and_halve` makes of it
@@ -29,15 +29,16 @@ def is_own(config: Config) -> bool:
 
 
 def atari_name(game: str, known: Iterable[str]) -> str:
-    """The snake-case name, e.g. beam_rider, of a game given by that name or as EnvPool's BeamRider-v5.
+    """The snake-case name, e.g. beam_rider, of a game given by a name of any library's: BeamRider-v5, beamrider.
 
     Raises:
       ConfigError: if `known` does not have it; the message has the nearest names.
     """
-    names = {form: name for name in known for form in (name, envpool_id(name))}
-    if game in names:
-        return names[game]
-    near = difflib.get_close_matches(game.lower(), [*names, *OWN], n=3)
+    names = {name.replace("_", ""): name for name in known}
+    plain = game_name(game).replace("_", "")
+    if plain in names:
+        return names[plain]
+    near = difflib.get_close_matches(game_name(game), [*names.values(), *OWN], n=3)
     hint = f"; near: {', '.join(near)}" if near else ""
     others = f"{', '.join(OWN)}, gymnasium:<id> or package.module:factory"
     raise refuse("game", game, f"an Atari game (breakout), {others}{hint}")

@@ -32,6 +32,8 @@ class GymnasiumEnvironment:
         name = config.game.removeprefix("gymnasium:")
         if name.count(":") > 1 or name.startswith(":"):
             raise refuse("game", config.game, "gymnasium:<id> or gymnasium:<module>:<id>")
+        if name.startswith("ALE/"):
+            name = f"ale_py:{name}"
         make = functools.partial(gymnasium.make, name, disable_env_checker=True, **config.env.kwargs)
 
         def make_one() -> gymnasium.Env:
@@ -47,7 +49,10 @@ class GymnasiumEnvironment:
         try:
             self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
-            raise refuse("game", config.game, f"the id of an environment ({one_line(error)})") from None
+            accepted = "the id of an environment, or gymnasium:<module>:<id> with the module that registers it"
+            missing = getattr(error.__cause__ or error, "name", None) if isinstance(error, ImportError) else None
+            why = f"{missing} is missing (pip install {missing})" if missing else one_line(error)
+            raise refuse("game", config.game, accepted, why=why) from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
         if not (is_pixels and isinstance(actions, spaces.Discrete)):

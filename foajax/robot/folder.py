@@ -24,7 +24,7 @@ from foajax.learning.agent import Agent
 from foajax.robot import golden, onnx_graph, smaller, stablehlo
 from foajax.runs import provenance
 from foajax.runs.agents import TrainedAgent, load_score
-from foajax.sensors import gaze, logpolar
+from foajax.sensors import gaze, geometry
 from foajax.sensors.frames import SMALLEST_STD
 from foajax.sensors.reconstruct import tables
 from foajax.sensors.sense import sense
@@ -195,7 +195,7 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
         std = max(float(statistics.std / statistics.weight), SMALLEST_STD)
     found: dict[str, Any] = {"mean": mean}
     if isinstance(sensor, LogPolarSensor):
-        cell, pixel, share = logpolar.shares(sensor)
+        cell, pixel, share = geometry.shares(sensor)
         first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
         return found | {"pixel": pixel.astype(int), "weight": (share / std).astype(np.float32), "first": first}
     assert isinstance(sensor, RingSensor)

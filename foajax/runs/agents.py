@@ -29,6 +29,7 @@ from foajax.learning.programs import make_state
 from foajax.runs import durable
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import PARAMETERS, is_run, load_config
+from foajax.runtime import refuse_fork
 from foajax.types import FrameStatistics, Params, TimeStep, TrainState
 
 FACTS = "agent.json"  # what the parameters' shapes depend on besides the configuration
@@ -70,7 +71,9 @@ class TrainedAgent:
 
         Raises:
           ValueError: frames of another type, shape or number.
+          RuntimeError: in a process that was forked from one that had JAX.
         """
+        refuse_fork()
         if not hasattr(self, "_state"):
             self.reset(len(frames))
         batch = len(self._starts)

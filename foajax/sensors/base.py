@@ -6,20 +6,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.sensors.window import Shape
-
-
-class PixelCount(NamedTuple):
-    """How many values a sensor gives of a gray frame."""
-
-    nominal: int  # as Table II counts: area over factor squared, ring by ring
-    actual: int  # values really shown with the gaze at the frame's centre
+from foajax.sensors.geometry import PixelCount, Shape
 
 
 @runtime_checkable
@@ -88,9 +80,3 @@ def boxes(
     """The areas' rectangles (top, left, height, width) in frame pixels, inner to outer. They may overhang the frame."""
     y, x = (int(coordinate) for coordinate in focal_point)
     return [(y - height // 2, x - width // 2, height, width) for height, width in sensor.areas]
-
-
-def move_inside(focal_point: Int[Array, "2"], window: Shape, frame_shape: Shape) -> Int[Array, "2"]:
-    """The nearest focal point whose area lies inside the frame."""
-    half, room = np.array(window) // 2, np.array(frame_shape) - window
-    return jnp.clip(focal_point, half, half + room)

@@ -5,15 +5,18 @@ They may be called inside of `jax.jit`, `jax.vmap` and `jax.grad` too.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Num
 
 from foajax.config.schema import SensorConfig
+from foajax.runtime import refuse_fork
 from foajax.sensors import sense as pure
 from foajax.sensors.base import Sensor
+from foajax.sensors.geometry import Shape
 from foajax.sensors.registry import make_sensor
-from foajax.sensors.window import Shape
 from foajax.types import HostArray
 
 _sense = jax.jit(pure.sense, static_argnames=("sensor", "bounds"))
@@ -43,8 +46,18 @@ def sense(
     Raises:
       ConfigError: a frame or a focal point of another rank; a focal point of fractions; a peripheral grid finer than
         the frame; other bounds, or 'window' and an area larger than the frame.
+      RuntimeError: in a process that was forked from one that had JAX.
     """
+    refuse_fork()
     return _sense(frame, focal_point, sensor=make_sensor(sensor), bounds=bounds)
+
+
+def sense_many(
+    frames: Num[HostArray, "B H W C"], focal_points: Int[HostArray, "B 2"], *, sensor: Sensor, bounds: str
+) -> tuple[Float[Array, "B _ _ C"], ...]:
+    """`sense` for a batch of frames, each with a focal point of its own."""
+    refuse_fork()
+    return jax.vmap(functools.partial(_sense, sensor=sensor, bounds=bounds))(frames, focal_points)
 
 
 def picture(
@@ -65,5 +78,6 @@ def picture(
     Returns:
       float32 [H, W, C], in the images' range.
     """
+    refuse_fork()
     images, focal_point = jax.tree.map(jnp.asarray, (tuple(images), focal_point))
     return _picture(images, focal_point, sensor=make_sensor(sensor), frame_shape=frame_shape)

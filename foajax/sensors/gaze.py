@@ -9,22 +9,21 @@ rest is ours.
 What a visual action is, `gaze.moves` says: a step from where the gaze is, or a cell of a grid to look at wherever
 the gaze was. A saccade may have a price (`price`).
 
-All functions are for one focal point; the caller vmaps.
+The functions take arrays of NumPy or of JAX and give the like. With JAX they are for one focal point, and the caller
+vmaps; NumPy's may have leading axes.
 """
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int
 
 from foajax.config.parse import refuse
-from foajax.config.schema import Config, GazeConfig
-from foajax.sensors.base import Sensor
-from foajax.sensors.registry import make_sensor
-
-Shape = tuple[int, int]  # rows, columns
+from foajax.config.schema import GazeConfig
+from foajax.sensors.geometry import Shape
 
 # (y, x) of stay, up, down, left, right; with nine actions, the diagonals too.
 _STRAIGHT = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
@@ -34,13 +33,13 @@ NAMES = ("stay", "up", "down", "left", "right", "up left", "up right", "down lef
 
 
 def move(
-    focal_point: Int[Array, "2"],
-    vision_action: Int[Array, ""],
+    focal_point: Int[Any, "*n 2"],
+    vision_action: Int[Any, "*n"],
     *,
     gaze: GazeConfig,
     window: Shape,
     frame_shape: Shape,
-) -> Int[Array, "2"]:
+) -> Int[Any, "*n 2"]:
     """The next focal point, clipped to its bounds.
 
     - moves 'steps': action 0 stays; then every direction by the smallest of `gaze.step`, by the next one, and so on.
@@ -53,9 +52,10 @@ def move(
       window: height and width of the focal area, or of its finest part (`bounded`).
       frame_shape: height and width of the frame.
     """
+    library = vision_action.__array_namespace__()
     if gaze.moves == "absolute":
-        return _clip(jnp.asarray(targets(gaze, frame_shape))[vision_action], gaze, window, frame_shape)
-    return _clip(focal_point + jnp.asarray(steps(gaze))[vision_action], gaze, window, frame_shape)
+        return _clip(library.asarray(targets(gaze, frame_shape))[vision_action], gaze, window, frame_shape)
+    return _clip(focal_point + library.asarray(steps(gaze))[vision_action], gaze, window, frame_shape)
 
 
 def steps(gaze: GazeConfig) -> Int[np.ndarray, "V 2"]:
@@ -84,27 +84,39 @@ def names(gaze: GazeConfig) -> tuple[str, ...]:
     return (NAMES[0], *(f"{name} {size}" for size in gaze.sizes for name in straight))
 
 
-def price(before: Int[Array, "2"], after: Int[Array, "2"], *, gaze: GazeConfig) -> Float[Array, ""]:
+def price(before: Int[Any, "*n 2"], after: Int[Any, "*n 2"], *, gaze: GazeConfig) -> Float[Any, "*n"]:
     """What it costs to move the focal point, in units of reward: 0 for who stays.
 
     `gaze.cost` times the Euclidean distance in frame pixels, or once for a move of any length. A move that the bounds
     shorten costs what is left of it.
     """
-    moved = (after - before).astype(jnp.float32)
-    distance = jnp.sqrt(jnp.sum(moved * moved))
-    return gaze.cost * (distance if gaze.cost_per == "pixel" else (distance > 0).astype(jnp.float32))
+    distance = saccade(before, after)
+    return gaze.cost * (distance if gaze.cost_per == "pixel" else (distance > 0).astype(np.float32))
 
 
-def start(key: PRNGKeyArray, *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Array, "2"]:
-    """The first focal point of an episode: the frame's centre, a given point, or any within bounds."""
+def saccade(before: Int[Any, "*n 2"], after: Int[Any, "*n 2"]) -> Float[Any, "*n"]:
+    """How far the focal point moved: the Euclidean distance, frame pixels."""
+    moved = (after - before).astype(np.float32)
+    return moved.__array_namespace__().sqrt((moved * moved).sum(-1))
+
+
+def start(random: Any, *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Any, "2"]:
+    """The first focal point of an episode: the frame's centre, a given point, or any within bounds.
+
+    A random one is drawn with `random`, a key of JAX's or a generator of NumPy's.
+    """
     if gaze.start == "random":
         low, high = limits(gaze=gaze, window=window, frame_shape=frame_shape)
-        return jax.random.randint(key, (2,), low, high + 1)
+        if isinstance(random, np.random.Generator):
+            return random.integers(low, high + 1, dtype=np.int32)
+        import jax
+
+        return jax.random.randint(random, (2,), low, high + 1)
     point = np.array(frame_shape) // 2 if gaze.start == "centre" else np.array(gaze.start)
-    return _clip(jnp.asarray(point), gaze, window, frame_shape)
+    return _clip(point, gaze, window, frame_shape)
 
 
-def scripted(age: Int[Array, ""], *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Array, "2"]:
+def scripted(age: Int[Any, ""], *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Any, "2"]:
     """The focal point `age` steps into an episode: `gaze.path` point by point, over and over, clipped.
 
     Raises:
@@ -112,11 +124,15 @@ def scripted(age: Int[Array, ""], *, gaze: GazeConfig, window: Shape, frame_shap
     """
     if not gaze.path:
         raise refuse("gaze.path", gaze.path, "at least one [y, x]")
-    return _clip(jnp.asarray(gaze.path)[age % len(gaze.path)], gaze, window, frame_shape)
+    path = age.__array_namespace__().asarray(gaze.path)
+    return _clip(path[age % len(gaze.path)], gaze, window, frame_shape)
 
 
-def bounded(gaze: GazeConfig, sensor: Sensor) -> Shape:
-    """Height and width of what has to stay inside the frame: the `window` of the functions of this module."""
+def bounded(gaze: GazeConfig, sensor: Any) -> Shape:
+    """Height and width of what has to stay inside the frame: the `window` of the functions of this module.
+
+    `sensor` is a `Sensor`, or the configuration of one.
+    """
     return sensor.finest if gaze.bounds == "fovea" else sensor.window
 
 
@@ -136,28 +152,33 @@ def limits(*, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> tuple[np.n
     return low, high
 
 
-def to_unit(point: Int[Array, "*n 2"], frame_shape: Shape) -> Float[Array, "*n 2"]:
+def to_unit(point: Int[Any, "*n 2"], frame_shape: Shape) -> Float[Any, "*n 2"]:
     """Focal points in [-1, 1): -1 at the first row or column, 0 at the frame's centre (H/2, W/2)."""
-    return jnp.stack([point[..., axis] / size * 2.0 - 1.0 for axis, size in enumerate(frame_shape)], -1)
+    return _stack(point[..., axis] / size * 2.0 - 1.0 for axis, size in enumerate(frame_shape))
 
 
-def to_reach(point: Int[Array, "*n 2"], *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Float[Array, "*n 2"]:
+def to_reach(point: Int[Any, "*n 2"], *, gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Float[Any, "*n 2"]:
     """Focal points in [-1, 1]: -1 and 1 at the `limits`, 0 in an axis along which the gaze cannot move."""
     low, high = limits(gaze=gaze, window=window, frame_shape=frame_shape)
     ends = enumerate(zip(low.tolist(), high.tolist(), strict=True))
-    return jnp.stack([(2 * point[..., axis] - (lo + hi)) / max(hi - lo, 1) for axis, (lo, hi) in ends], -1)
+    return _stack((2 * point[..., axis] - (lo + hi)) / max(hi - lo, 1) for axis, (lo, hi) in ends)
 
 
-def from_unit(coordinates: Float[Array, "*n 2"], frame_shape: Shape) -> Int[Array, "*n 2"]:
+def from_unit(coordinates: Float[Any, "*n 2"], frame_shape: Shape) -> Int[Any, "*n 2"]:
     """The nearest focal points inside the frame: the inverse of `to_unit`."""
     points = [(coordinates[..., axis] + 1.0) * (size / 2) for axis, size in enumerate(frame_shape)]
-    clipped = [jnp.clip(jnp.round(p), 0, size - 1) for p, size in zip(points, frame_shape, strict=True)]
-    return jnp.stack(clipped, -1).astype(jnp.int32)
+    clipped = [p.round().clip(0, size - 1) for p, size in zip(points, frame_shape, strict=True)]
+    return _stack(clipped).astype(np.int32)
 
 
-def _clip(point: Int[Array, "2"], gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Array, "2"]:
+def _stack(coordinates: Iterable[Any]) -> Any:
+    first, second = coordinates
+    return first.__array_namespace__().stack([first, second], -1)
+
+
+def _clip(point: Int[Any, "*n 2"], gaze: GazeConfig, window: Shape, frame_shape: Shape) -> Int[Any, "*n 2"]:
     low, high = limits(gaze=gaze, window=window, frame_shape=frame_shape)
-    return jnp.clip(point, low, high).astype(jnp.int32)
+    return point.clip(low, high).astype(np.int32)
 
 
 def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[np.ndarray, "H W"]:
@@ -165,10 +186,3 @@ def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[n
     counts = np.zeros(frame_shape, int)
     np.add.at(counts, tuple(points.T), 1)
     return counts
-
-
-def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest focal point (y, x)."""
-    return limits(
-        gaze=config.gaze, window=bounded(config.gaze, make_sensor(config.sensor)), frame_shape=config.env.frame_shape
-    )

@@ -13,8 +13,6 @@ sum, at the same cost wherever the focal point is. Windows are squares of side 2
 from __future__ import annotations
 
 import functools
-import itertools
-import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,9 +20,8 @@ from jaxtyping import Array, Float, Int, Num
 
 from foajax.config.schema import LogPolarSensor
 from foajax.sensors.base import Sensor
-from foajax.sensors.window import Shape, look, place
-
-_SAMPLES = 32  # sample points along each side of a cell, to measure how much of it lies in a pixel
+from foajax.sensors.geometry import Shape, cell_of_pixel, shares
+from foajax.sensors.window import look, place
 
 
 class LogPolar(Sensor):
@@ -73,19 +70,8 @@ def warp(window: Float[Array, "side side"], *, sensor: LogPolarSensor) -> Float[
 
 def unwarp(image: Float[Array, "rings wedges"], *, sensor: LogPolarSensor) -> Float[Array, "side side"]:
     """The inverse, for pictures: each pixel shows the cell that its centre lies in, 0 outside the disc."""
-    cell, inside = _cell_of_pixel(sensor)
+    cell, inside = cell_of_pixel(sensor)
     return jnp.where(inside, image.reshape(-1)[cell], 0.0)
-
-
-def ring_edges(sensor: LogPolarSensor) -> np.ndarray:
-    """Radii [rings + 1] at which the rings begin and end, frame pixels: 0, fovea, ..., radius."""
-    growth = sensor.radius / sensor.fovea
-    return np.concatenate([[0.0], sensor.fovea * growth ** (np.arange(sensor.rings) / (sensor.rings - 1))])
-
-
-def shares(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(cell, pixel of the window, weight) of all that `warp` adds up, sorted by cell; cells and pixels are numbered."""
-    return _bilinear_weights(sensor) if sensor.sampling == "bilinear" else _area_weights(sensor)
 
 
 @functools.lru_cache
@@ -109,53 +95,3 @@ def _tables(sensor: LogPolarSensor) -> tuple[tuple[np.ndarray, np.ndarray], ...]
         rows, k = slice(first * sensor.wedges, last * sensor.wedges), widths[first:last].max()
         tables.append((index[rows, :k], weights[rows, :k]))
     return tuple(tables)
-
-
-def _bilinear_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Four (cell, pixel, weight) for each cell, sorted by cell.
-
-    The centre of a cell halves its angle and, but for the innermost ring, its logarithmic radius.
-    """
-    edges = ring_edges(sensor)
-    radius = np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])[:, None]
-    angle = 2 * np.pi * (np.arange(sensor.wedges) + 0.5) / sensor.wedges
-    side = sensor.window[0]
-    y, x = (np.ravel(side / 2 - 0.5 + radius * turn(angle)) for turn in (np.sin, np.cos))
-    top, left = np.floor(y), np.floor(x)
-    pixels, weights = [], []
-    for row, row_weight in ((top, top + 1 - y), (top + 1, y - top)):
-        for column, column_weight in ((left, left + 1 - x), (left + 1, x - left)):
-            # The outermost centres may lie half a pixel beyond the last pixel's: it stands in.
-            pixels.append(np.clip(row, 0, side - 1) * side + np.clip(column, 0, side - 1))
-            weights.append(row_weight * column_weight)
-    cell = np.repeat(np.arange(len(y)), 4)
-    return cell, np.stack(pixels, 1).ravel(), np.stack(weights, 1).ravel()
-
-
-def _area_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(cell, pixel, share of the cell's area in that pixel), sorted by cell.
-
-    Measured with a grid of points in each cell, evenly spaced in area; ring by ring, to bound the memory.
-    """
-    fraction = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    wedge = np.arange(sensor.wedges)
-    angle = 2 * np.pi * (wedge[:, None] + fraction) / sensor.wedges
-    side, parts = sensor.window[0], []
-    for ring, (inner, outer) in enumerate(itertools.pairwise(ring_edges(sensor))):
-        radius = np.sqrt(inner**2 + (outer**2 - inner**2) * fraction)[:, None]
-        y, x = (np.floor(side / 2 + radius * turn(angle)[:, None, :]).astype(int) for turn in (np.sin, np.cos))
-        cell = (ring * sensor.wedges + wedge)[:, None, None]
-        parts.append(np.unique((cell * side + y) * side + x, return_counts=True))
-    hits, count = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return hits // side**2, hits % side**2, count / _SAMPLES**2
-
-
-@functools.lru_cache
-def _cell_of_pixel(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray]:
-    """For each pixel of the window [side, side], the cell that its centre lies in, and if it lies in any."""
-    offset = np.arange(sensor.window[0]) + 0.5 - sensor.window[0] / 2
-    radius = np.hypot(offset[:, None], offset)
-    ring = np.searchsorted(ring_edges(sensor)[1:], radius, side="right")
-    turn = np.arctan2(offset[:, None], offset) / (2 * math.pi) % 1.0
-    wedge = np.minimum((turn * sensor.wedges).astype(int), sensor.wedges - 1)
-    return np.minimum(ring, sensor.rings - 1) * sensor.wedges + wedge, ring < sensor.rings

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import functools
-import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.config.parse import refuse, replace
+from foajax.config.parse import replace
 from foajax.config.schema import RingSensor
-from foajax.sensors.base import PixelCount, Sensor
-from foajax.sensors.window import Shape, look, place
+from foajax.sensors.base import Sensor
+from foajax.sensors.geometry import (
+    PixelCount,
+    Shape,
+    block_edges,
+    cell_edges,
+    covered,
+    hidden_blocks,
+    offsets,
+    ring_count,
+    ring_shapes,
+)
+from foajax.sensors.window import look, place
 
 
 class Rings(Sensor):
@@ -55,10 +64,7 @@ class Rings(Sensor):
 
     def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
         """The frame's, or the rings' in blocks and the grid's."""
-        if self.in_place:
-            return (frame_shape,)
-        shapes = [(-(-height // factor), -(-width // factor)) for height, width, factor in self.config.rings]
-        return (*shapes, self.config.peripheral) if self.config.peripheral else tuple(shapes)
+        return (frame_shape,) if self.in_place else ring_shapes(self.config)
 
     def picture(
         self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
@@ -78,19 +84,7 @@ class Rings(Sensor):
         (16 for 70x70 in 5x5). Actual differs where blocks do not divide an area (70 by 4) or straddle
         a finer ring.
         """
-        config, nominal, inner = self.config, 0.0, 0
-        for height, width, factor in config.rings:
-            nominal += (height * width - inner) / factor**2
-            inner = height * width
-        actual = sum(math.prod(shape) for shape in self.packed.image_shapes(frame_shape))
-        actual -= sum(int(hidden.sum()) for hidden in hidden_blocks(config))
-        if config.peripheral is not None:
-            least = centred = 1  # cells hidden along one axis, times those along the other
-            for edges, size, length in zip(cell_edges(config, frame_shape), frame_shape, self.window, strict=True):
-                hidden = [int(covered(edges, first, length).sum()) for first in range(size - length + 1)]
-                least, centred = least * min(hidden), centred * hidden[size // 2 - length // 2]
-            nominal, actual = nominal + math.prod(config.peripheral) - least, actual - centred
-        return PixelCount(round(nominal), actual)
+        return ring_count(self.config, frame_shape)
 
     @functools.cached_property
     def packed(self) -> Rings:
@@ -141,9 +135,6 @@ def sense_cells(frame: Num[Array, "H W"], sensor: RingSensor) -> Float[Array, "r
     """The peripheral grid: the whole frame, coarse, nothing hidden yet."""
     height, width = frame.shape
     rows, columns = cell_edges(sensor, (height, width))
-    if not (np.diff(rows).all() and np.diff(columns).all()):
-        accepted = f"a grid no finer than the frame, {height}x{width}"
-        raise refuse("sensor.peripheral", sensor.peripheral, accepted)
     if sensor.pooling == "stride":
         return frame[rows[:-1]][:, columns[:-1]].astype(jnp.float32)
     # Whole columns of the product are contiguous sums; 'highest' keeps accelerators from rounding.
@@ -189,37 +180,3 @@ def _repeat(x: Float[Array, "_ _"], counts: np.ndarray, axis: int) -> Float[Arra
     if (counts == counts[0]).all():
         return jnp.repeat(x, int(counts[0]), axis)
     return jnp.take(x, np.repeat(np.arange(len(counts)), counts), axis)
-
-
-def offsets(sensor: RingSensor) -> list[Shape]:
-    """Top-left corners of the rings inside the focal area."""
-    height, width = sensor.window
-    return [(height // 2 - ring[0] // 2, width // 2 - ring[1] // 2) for ring in sensor.rings]
-
-
-def block_edges(size: int, factor: int) -> np.ndarray:
-    """Where the blocks of a ring begin and end along an axis; the last one may be shorter."""
-    return np.append(np.arange(0, size, factor), size)
-
-
-def cell_edges(sensor: RingSensor, frame_shape: Shape) -> list[np.ndarray]:
-    """Where the cells of the peripheral grid begin and end, along rows and along columns."""
-    assert sensor.peripheral is not None
-    return [np.arange(n + 1) * size // n for n, size in zip(sensor.peripheral, frame_shape, strict=True)]
-
-
-def covered(edges: np.ndarray, first: Any, length: int) -> Any:
-    """Which of the intervals between `edges` lie altogether inside [first, first + length)."""
-    return (edges[:-1] >= first) & (edges[1:] <= first + length)
-
-
-def hidden_blocks(sensor: RingSensor) -> list[np.ndarray]:
-    """Per ring but the first, which blocks [rows, columns] the next finer ring covers altogether."""
-    hidden = []
-    for inner, outer in zip(sensor.rings, sensor.rings[1:], strict=False):
-        rows, columns = (
-            covered(block_edges(size, outer[2]), size // 2 - length // 2, length)
-            for size, length in zip(outer[:2], inner[:2], strict=True)
-        )
-        hidden.append(rows[:, None] & columns)
-    return hidden

@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Num
 
-from foajax.config.parse import refuse
 from foajax.config.schema import SensorConfig
-from foajax.sensors.base import Sensor, move_inside
+from foajax.sensors.base import Sensor
+from foajax.sensors.geometry import Shape, check_look, move_inside
 from foajax.sensors.registry import make_sensor
-from foajax.sensors.window import Shape
 from foajax.types import HostArray
 
 
@@ -41,24 +40,13 @@ def sense(
         the frame; other bounds, or 'window' and an area larger than the frame.
     """
     sensor = make_sensor(sensor)
-    if bounds not in ("window", "point"):
-        raise refuse("bounds", bounds, "'window' or 'point'")
-    frame, focal_point = jnp.asarray(frame), jnp.asarray(focal_point)
-    if not jnp.issubdtype(focal_point.dtype, jnp.integer):
-        raise refuse("focal_point", focal_point.dtype, "integers, which foajax.sensors.gaze.from_unit makes")
-    if focal_point.shape != (2,):
-        raise refuse("focal_point", list(focal_point.shape), "(y, x), jax.vmap for more")
-    if frame.ndim not in (2, 3):
-        raise refuse("frame", list(frame.shape), "[H, W] or [H, W, C], jax.vmap for more")
+    frame, point = jnp.asarray(frame), jnp.asarray(focal_point)
+    check_look(frame, point, sensor.window, bounds)
     if bounds == "window":
-        shape = (frame.shape[0], frame.shape[1])
-        if sensor.window[0] > shape[0] or sensor.window[1] > shape[1]:
-            accepted = f"'point' where the focal area {sensor.window} exceeds {shape}"
-            raise refuse("bounds", "window", accepted)
-        focal_point = move_inside(focal_point, sensor.window, shape)
+        point = move_inside(point, sensor.window, (frame.shape[0], frame.shape[1]))
     if frame.ndim == 2:
-        return tuple(image[..., None] for image in sensor.sense(frame, focal_point, bounds))
-    return jax.vmap(lambda channel: sensor.sense(channel, focal_point, bounds), in_axes=2, out_axes=2)(frame)
+        return tuple(image[..., None] for image in sensor.sense(frame, point, bounds))
+    return jax.vmap(lambda channel: sensor.sense(channel, point, bounds), in_axes=2, out_axes=2)(frame)
 
 
 def picture(

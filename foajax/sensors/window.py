@@ -11,7 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-Shape = tuple[int, int]  # rows, columns
+from foajax.sensors.geometry import Shape
+
 Pool = Callable[[Num[Array, "h w"]], tuple[Float[Array, "_ _"], ...]]  # linear; what a sensor makes of its window
 
 

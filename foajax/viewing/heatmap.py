@@ -17,8 +17,10 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from foajax.config.parse import refuse
+from foajax.config.schema import Config
 from foajax.runs import durable
-from foajax.sensors.gaze import bounds, count
+from foajax.sensors import gaze
+from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
 from foajax.viewing.style import STYLE
 
@@ -124,8 +126,14 @@ def heat_map(recordings: Sequence[Recording]) -> HeatMap:
     low, high = bounds(config)
     policy = "greedy" if recordings[0].greedy else "sampled"
     whole = all(each.is_over for each in recordings)
-    counts = count(points, config.env.frame_shape)
+    counts = gaze.count(points, config.env.frame_shape)
     return HeatMap(counts, mean, low, high, len(recordings), env_steps, policy, whole)
+
+
+def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest focal point (y, x) of an agent."""
+    window = gaze.bounded(config.gaze, make_sensor(config.sensor))
+    return gaze.limits(gaze=config.gaze, window=window, frame_shape=config.env.frame_shape)
 
 
 def save(heat: HeatMap, directory: Path, title: str) -> None:

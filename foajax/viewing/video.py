@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import itertools
 import subprocess
@@ -13,7 +14,7 @@ import numpy as np
 from PIL import Image
 from rich.progress import Progress
 
-from foajax.config.parse import refuse
+from foajax.config.parse import one_line, refuse
 from foajax.envs.make import steps_per_second
 from foajax.viewing.recording import Recording
 from foajax.viewing.scene import Scene
@@ -63,5 +64,16 @@ def _write_gif(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
     small[0].save(file, save_all=True, append_images=small[1:], duration=durations, loop=0)
 
 
-def has_ffmpeg() -> bool:
-    return importlib.util.find_spec("imageio_ffmpeg") is not None
+@functools.cache
+def why_no_mp4() -> str | None:
+    """What is missing before an mp4 can be written; None where nothing is."""
+    install = "pip install imageio-ffmpeg"
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        return f"imageio-ffmpeg is missing ({install})"
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    try:
+        subprocess.run([get_ffmpeg_exe(), "-version"], check=True, capture_output=True)
+    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
+        return f"the ffmpeg of imageio-ffmpeg does not run ({one_line(error)}; {install}, or IMAGEIO_FFMPEG_EXE=<path>)"
+    return None

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from foajax import cli
-from foajax.config.compose import compose, list_experiments
+from foajax.config.compose import checked, compose, list_experiments
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config, HeadConfig, LogPolarSensor, RingSensor
 from foajax.launch import sweep
@@ -489,3 +489,18 @@ def test_an_installed_wheel_brings_the_experiments_along(tmp_path):
     ).stdout.split()
     assert Path(printed[0]).is_relative_to(tmp_path)
     assert printed[1:] == [*list_experiments(), "7"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["SpaceInvaders", "space_invaders", "ALE/SpaceInvaders-v5", "SpaceInvadersNoFrameskip-v4", "SpaceInvaders-v5"],
+)
+def test_a_game_has_one_name_whatever_it_is_called(name):
+    config = compose([f"game={name}"])
+    assert config.game == "space_invaders" and config.run_dir == "runs/space_invaders-constant70-s0"
+    assert checked(f"game={name},pong", sweep=True) == "++game=space_invaders,pong"
+
+
+@pytest.mark.parametrize("name", ["gymnasium:ALE/Pong-v5", "probe:match", "mine:Walk", "up_n_down"])
+def test_other_names_of_games_stay_as_they_are(name):
+    assert compose([f"game={name}"]).game == name

@@ -13,6 +13,7 @@ import pytest
 from foajax.config.schema import LogPolarSensor
 from foajax.sensors import logpolar
 from foajax.sensors.base import boxes
+from foajax.sensors.geometry import ring_edges
 from foajax.sensors.registry import make_sensor
 from foajax.sensors.sense import picture, sense
 
@@ -45,7 +46,7 @@ def smooth_frame(shape=(80, 80)):
     return (np.sin(y / 4 + x / 9) * np.cos(x / 5 - 1)).astype(np.float32)
 
 
-edges_of = functools.cache(logpolar.ring_edges)
+edges_of = functools.cache(ring_edges)
 
 
 def cell_at(sensor, dy, dx):
@@ -58,7 +59,7 @@ def cell_at(sensor, dy, dx):
 
 def test_the_geometry_by_hand():
     sensor = LogPolarSensor(rings=4, wedges=8, fovea=1.0, radius=8.0)
-    np.testing.assert_allclose(logpolar.ring_edges(sensor), [0, 1, 2, 4, 8])
+    np.testing.assert_allclose(ring_edges(sensor), [0, 1, 2, 4, 8])
     assert boxes(make_sensor(sensor), (40, 40)) == [(32, 32, 16, 16)]
     # One bright pixel, its centre at (0.5, 3.5) right of the focal point: the third ring's first wedge,
     # which begins at the x axis and turns downwards.
@@ -104,7 +105,7 @@ def test_bilinear_matches_a_loop(name):
     sensor = SENSORS[name]
     frames, points = frames_and_points()
     (images,) = batched(sensor)(frames, points)
-    edges, half = logpolar.ring_edges(sensor), sensor.window[0] // 2
+    edges, half = ring_edges(sensor), sensor.window[0] // 2
     for frame, point, image in zip(np.asarray(frames), np.asarray(points), images, strict=True):
 
         def pixel(y, x, frame=frame, point=point):
@@ -141,7 +142,7 @@ def test_warp_matches_opencv(sampling, largest, mean):
     sensor = LogPolarSensor(rings=41, wedges=60, fovea=1.0, radius=30.0, sampling=sampling)
     frame, points = smooth_frame(), [(40, 40), (45, 33)]
     (images,) = batched(sensor)(jnp.asarray([frame, frame]), jnp.array(points))
-    edges = logpolar.ring_edges(sensor)
+    edges = ring_edges(sensor)
     centres = np.sqrt(edges[1:-1] * edges[2:])  # all but the innermost ring's
     radii = opencv_radii(4000, limit=32.0)
     columns = np.abs(radii[:, None] - centres).argmin(0)
@@ -165,7 +166,7 @@ def test_unwarp_matches_opencv():
         return (np.sin(radius / 4) * np.cos(2 * angle)).astype(np.float32)
 
     angle = 2 * np.pi * (np.arange(240) + 0.5) / 240
-    edges = logpolar.ring_edges(sensor)
+    edges = ring_edges(sensor)
     ours = logpolar.unwarp(jnp.asarray(pattern((edges[:-1, None] + edges[1:, None]) / 2, angle)), sensor=sensor)
     polar = pattern(opencv_radii(200, limit=31.0), (angle - angle[0])[:, None])
     flags = cv2.WARP_POLAR_LOG | cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR | cv2.WARP_FILL_OUTLIERS

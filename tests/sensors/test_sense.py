@@ -13,7 +13,8 @@ from hypothesis import given, settings
 
 from foajax.config.parse import ConfigError
 from foajax.config.schema import LogPolarSensor, RingSensor
-from foajax.sensors.base import PixelCount, boxes
+from foajax.sensors.base import boxes
+from foajax.sensors.geometry import PixelCount
 from foajax.sensors.registry import make_sensor
 from foajax.sensors.sense import picture, sense
 

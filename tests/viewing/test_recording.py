@@ -13,10 +13,11 @@ from foajax.config.parse import ConfigError
 from foajax.envs.make import action_names, steps_per_second
 from foajax.learning.agent import Agent
 from foajax.sensors.frames import to_frame
-from foajax.sensors.gaze import DIRECTIONS, bounds
+from foajax.sensors.gaze import DIRECTIONS
 from foajax.types import Outcome, TimeStep
 from foajax.viewing import games
 from foajax.viewing.games import play
+from foajax.viewing.heatmap import bounds
 from foajax.viewing.recording import Screens, record
 
 

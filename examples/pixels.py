@@ -1,0 +1,45 @@
+"""Environments of other libraries as pixels with discrete actions, for foajax's own learner.
+
+    cd examples
+    foajax train game=gymnasium:pixels:MiniGrid env.kwargs.task=MiniGrid-Empty-8x8-v0 experiment=constant50_sub2_packed
+    MUJOCO_GL=egl foajax train game=gymnasium:pixels:Camera env.kwargs.task=InvertedPendulum-v5
+
+Gymnasium's CarRacing needs none of it:
+
+    foajax train game=gymnasium:CarRacing-v3 env.kwargs.continuous=false experiment=constant70_packed
+"""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+from gymnasium.wrappers import AddRenderObservation, TransformAction
+
+
+def minigrid(task: str = "MiniGrid-Empty-8x8-v0", tile_size: int = 10, **kwargs) -> gymnasium.Env:
+    """A MiniGrid task, seen from above in colour; `pip install minigrid`."""
+    from minigrid.wrappers import ImgObsWrapper, RGBImgObsWrapper
+
+    return ImgObsWrapper(RGBImgObsWrapper(gymnasium.make(task, **kwargs), tile_size=tile_size))
+
+
+def camera(task: str = "InvertedPendulum-v5", size: int = 84, levels: int = 3, **kwargs) -> gymnasium.Env:
+    """A MuJoCo task as its camera sees it; `pip install "gymnasium[mujoco]"`.
+
+    An action drives one joint and leaves the others at 0. Actions 0 .. joints * levels - 1 give a joint one of `levels`
+    forces, from its least to its greatest. Without a screen set MUJOCO_GL=egl, or osmesa.
+    """
+    env = AddRenderObservation(gymnasium.make(task, render_mode="rgb_array", width=size, height=size, **kwargs))
+    low, high = env.action_space.low, env.action_space.high
+
+    def drive(action: int) -> np.ndarray:
+        joint, level = divmod(int(action), levels)
+        forces = np.zeros_like(low)
+        forces[joint] = low[joint] + (high[joint] - low[joint]) * level / (levels - 1)
+        return forces
+
+    return TransformAction(env, drive, gymnasium.spaces.Discrete(len(low) * levels))
+
+
+gymnasium.register("MiniGrid", minigrid)
+gymnasium.register("Camera", camera)

@@ -1,0 +1,84 @@
+"""stable-baselines3's PPO learns what to do and where to look.
+
+    pip install foajax stable-baselines3
+    python stable_baselines3_ppo.py ALE/Pong-v5 --steps 1000000
+
+PPO takes both actions as one `MultiDiscrete`, [natural, visual]. Images are uint8, which `MultiInputPolicy` takes for
+images: it divides them by 255, and its own network wants 36x36 pixels at least. A packed focal area is smaller, so the
+features here have smaller filters.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import ale_py
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+import foajax
+
+gymnasium.register_envs(ale_py)
+
+
+def make(game: str, sensor: str) -> gymnasium.Env:
+    """An Atari game, four frames a decision and clipped rewards, through a sensor."""
+    env = gymnasium.make(game, frameskip=1, repeat_action_probability=0.0)
+    env = gymnasium.wrappers.AtariPreprocessing(env, frame_skip=4)
+    env = gymnasium.wrappers.TransformReward(env, np.sign)
+    return foajax.FoveatedObservation(env, sensor, dtype=np.uint8, actions="multidiscrete")
+
+
+class Features(BaseFeaturesExtractor):
+    """Two small convolutions for each image, and the focal point beside them."""
+
+    def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
+        super().__init__(observation_space, features_dim=1)
+        self.images = nn.ModuleDict()
+        width = 2  # of the focal point
+        for name, space in observation_space.items():
+            if name == "focal_point":
+                continue
+            layers = [nn.Conv2d(space.shape[0], 32, 4, 2), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.Flatten()]
+            self.images[name] = nn.Sequential(*layers)
+            with torch.no_grad():
+                width += self.images[name](torch.zeros(1, *space.shape)).shape[1]
+        self._features_dim = width
+
+    def forward(self, observation: dict[str, torch.Tensor]) -> torch.Tensor:
+        parts = [network(observation[name]) for name, network in self.images.items()]
+        return torch.cat([*parts, observation["focal_point"]], dim=1)
+
+
+def train(game: str, sensor: str, steps: int, num_envs: int, seed: int = 0) -> PPO:
+    """A trained model; `steps` are those of all environments together."""
+    envs = make_vec_env(make, num_envs, seed=seed, env_kwargs={"game": game, "sensor": sensor})
+    model = PPO(
+        "MultiInputPolicy",
+        envs,
+        n_steps=128,
+        batch_size=256,
+        n_epochs=4,
+        clip_range=0.1,
+        ent_coef=0.01,
+        learning_rate=2.5e-4,
+        policy_kwargs={"features_extractor_class": Features},
+        seed=seed,
+        verbose=1,
+    )
+    return model.learn(steps)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("game", nargs="?", default="ALE/Pong-v5")
+    parser.add_argument("--sensor", default="constant70_packed")
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--num-envs", type=int, default=8)
+    options = parser.parse_args()
+    train(options.game, options.sensor, options.steps, options.num_envs).save("foajax_ppo")
