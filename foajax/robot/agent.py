@@ -26,7 +26,6 @@ except ImportError:
     cv2 = None  # type: ignore[assignment]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue in gray (ITU-R BT.601)
-DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)])  # (y, x)
 SCREEN = (210, 160)  # an Atari screen's rows and columns
 
 
@@ -89,7 +88,7 @@ class Agent:
         natural, vision, gaze = self._choose(outputs["natural_logits"]), 0, self.facts["gaze"]
         if gaze["mode"] in ("learned", "random"):
             drawn = gaze["mode"] == "random"
-            vision = int(self._random.integers(gaze["actions"])) if drawn else self._choose(outputs["vision_logits"])
+            vision = int(self._random.integers(len(gaze["moves"]))) if drawn else self._choose(outputs["vision_logits"])
         self.core = {name: outputs[f"next_{name}"] for name in self.core}
         self.outputs, self.looked_at, self.last_actions = outputs, self.focal_point, (natural, vision)
         self.age += 1
@@ -135,7 +134,7 @@ class Agent:
 
     def _move(self, vision: int) -> np.ndarray:
         gaze, path = self.facts["gaze"], self.facts["gaze"]["path"]
-        to = self.focal_point + gaze["step"] * DIRECTIONS[vision]
+        to = self.focal_point * gaze["relative"] + gaze["moves"][vision]
         return np.array(path[self.age % len(path)]) if gaze["mode"] == "scripted" else np.clip(to, *self._limits)
 
 

@@ -25,6 +25,7 @@ from foajax.robot import golden, onnx_graph, smaller, stablehlo
 from foajax.runs import provenance
 from foajax.runs.agents import TrainedAgent, load_score
 from foajax.sensors import gaze, geometry
+from foajax.sensors.base import Sensor
 from foajax.sensors.frames import SMALLEST_STD
 from foajax.sensors.reconstruct import tables
 from foajax.sensors.sense import sense
@@ -153,7 +154,7 @@ def facts(stored: TrainedAgent) -> dict[str, Any]:
         "normalisation": _normalisation(agent, stored.statistics),
         "sensor": to_mapping(config.sensor),
         "window": list(agent.sensor.window),
-        "gaze": _gaze(config, agent.sensor.window),
+        "gaze": _gaze(config, agent.sensor),
         "side": {
             "focal_point": network.focal_scale if sees_point else None,
             "last_actions": last,
@@ -169,17 +170,19 @@ def _normalisation(agent: Agent, statistics: FrameStatistics) -> str:
     return "frame" if mode in ("running", "pixel") and not statistics.weight > 0 else mode
 
 
-def _gaze(config: Config, window: tuple[int, int]) -> dict[str, Any]:
-    """The gaze with its points moved within bounds."""
-    look = config.gaze
-    low, high = gaze.limits(gaze=look, window=window, frame_shape=config.env.frame_shape)
+def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
+    """The gaze with its points moved within bounds; `moves` are what visual actions add, or where they look."""
+    look, frame_shape = config.gaze, config.env.frame_shape
+    low, high = gaze.limits(gaze=look, window=gaze.bounded(look, sensor), frame_shape=frame_shape)
+    relative = look.moves == "steps"
+    moves = gaze.steps(look) if relative else gaze.targets(look, frame_shape)
     path = [np.clip(point, low, high).tolist() for point in look.path]
     start: Any = path[0] if look.mode == "scripted" else look.start
     if start == "centre":
-        start = [size // 2 for size in config.env.frame_shape]
+        start = [size // 2 for size in frame_shape]
     if start != "random":
         start = np.clip(start, low, high).tolist()
-    facts = {"mode": look.mode, "actions": look.actions, "step": look.step, "bounds": look.bounds}
+    facts = {"mode": look.mode, "relative": relative, "moves": moves.tolist()}
     return facts | {"start": start, "path": path, "limits": [low.tolist(), high.tolist()]}
 
 

@@ -31,6 +31,8 @@ SENSORS = {
 EPISODES = {
     "learned": ["experiment=constant70_p_packed"],
     "canvas": ["experiment=decreasing_p", "gaze.bounds=point", "gaze.actions=9", "gaze.step=11"],
+    "several sizes": ["experiment=constant50_sub2_packed", "gaze.step=[3,20]", "gaze.bounds=fovea"],
+    "absolute": ["experiment=constant50_sub2_packed", "gaze.moves=absolute", "gaze.grid=[3,4]", "gaze.bounds=point"],
     "log-polar": ["experiment=logpolar", "gaze.step=7", "gaze.start=[70,3]"],
     "none": ["experiment=nonfoa"],
     "frozen": ["experiment=constant50_sub1_packed", "gaze=frozen", "gaze.start=[20,60]"],
@@ -147,7 +149,7 @@ def test_a_gaze_at_random_starts_and_moves_within_its_limits(make_stored, fill):
             before = agent.focal_point
             _, vision = agent.decide(screen)
             visions.append(vision)
-            moved = before + agent.facts["gaze"]["step"] * robot.DIRECTIONS[vision]
+            moved = before + np.array(agent.facts["gaze"]["moves"])[vision]
             assert (agent.focal_point == np.clip(moved, low, high)).all()
     assert len(starts) > 15
     assert set(visions) == set(range(5))

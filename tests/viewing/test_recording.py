@@ -10,6 +10,7 @@ import pytest
 
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
+from foajax.envs.base import Environment
 from foajax.envs.make import action_names, steps_per_second
 from foajax.learning.agent import Agent
 from foajax.sensors.frames import to_frame
@@ -109,8 +110,10 @@ def test_a_greedy_game_takes_the_likeliest_actions(breakout_agent):
     np.testing.assert_array_equal(game.vision_action, game.vision_probs.argmax(1))
 
 
-class UnequalGames:
+class UnequalGames(Environment):
     """Two environments: one whose games last 2 steps, one whose games last 5."""
+
+    num_envs, num_actions, crop_top, lives = 2, 4, None, None
 
     def reset(self):
         self._age = np.zeros(2, int)
