@@ -22,7 +22,7 @@ from foajax.runs.directory import load_config
 from foajax.runtime import use_compilation_cache
 from foajax.sensors.registry import make_sensor
 from foajax.viewing.player_page import write_page
-from foajax.viewing.recording import play, progress_bar
+from foajax.viewing.recording import progress_bar, watch
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
 _LOOK_AT = """What to look at:
@@ -75,7 +75,7 @@ def demo(arguments: Sequence[str]) -> None:
     use_compilation_cache()
     print(_introduction(path.name, stored.agent.config))
     with progress_bar() as bar:
-        recording = next(play(stored, bar, seed=options.seed, greedy=False, max_steps=options.steps))
+        recording = next(watch(stored, bar, seed=options.seed, greedy=False, max_steps=options.steps))
     page = write_page(recording, directory).resolve().as_uri()
     ended = "The game was over" if recording.is_over else "The demo stopped"
     score = load_score(path)

@@ -16,7 +16,7 @@ from foajax.config.parse import Section
 from foajax.runs.agents import load_agent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing.player_page import write_page
-from foajax.viewing.recording import play, progress_bar
+from foajax.viewing.recording import progress_bar, watch
 
 
 class Options(Section):
@@ -37,7 +37,7 @@ def player(arguments: Sequence[str]) -> None:
     stored, directory = load_agent(options.run, trust=options.trust), cli.make_directory(options.out)
     with progress_bar() as bar:
         greedy = options.policy == "greedy"
-        recording = next(play(stored, bar, seed=options.seed, greedy=greedy, max_steps=options.steps))
+        recording = next(watch(stored, bar, seed=options.seed, greedy=greedy, max_steps=options.steps))
     print(write_page(recording, directory))
 
 

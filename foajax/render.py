@@ -19,7 +19,7 @@ from foajax.config.parse import Section, refuse
 from foajax.runs.agents import load_agent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing import heatmap
-from foajax.viewing.recording import play, progress_bar
+from foajax.viewing.recording import progress_bar, watch
 from foajax.viewing.video import why_no_mp4, write_video
 
 
@@ -51,7 +51,7 @@ def render(arguments: Sequence[str]) -> None:
     recordings, written = [], []
     with progress_bar() as bar:
         greedy = options.policy == "greedy"
-        games = play(stored, bar, episodes=options.episodes, seed=options.seed, greedy=greedy, max_steps=options.steps)
+        games = watch(stored, bar, episodes=options.episodes, seed=options.seed, greedy=greedy, max_steps=options.steps)
         for recording in games:
             if options.video:
                 written.append(directory / f"episode-{recording.seed}.{suffix}")

@@ -44,7 +44,7 @@ class Options(Section):
             raise refuse("out", self.out, "a file name that ends in .png")
 
 
-def play(config: Config, steps: int) -> np.ndarray:
+def walk(config: Config, steps: int) -> np.ndarray:
     """The frame after `steps` random actions, float32 [H, W] in [0, 1]."""
     environment = make(config, num_envs=1, seed=config.seed)
     try:
@@ -73,7 +73,7 @@ def show(arguments: Sequence[str]) -> None:
     for y, x in points:
         if not (0 <= y < height and 0 <= x < width):
             raise refuse("points", f"[{y}, {x}]", f"[y, x] inside the frame, {height}x{width}")
-    frame = play(config, options.steps)
+    frame = walk(config, options.steps)
     if sheet:
         image = contact_sheet(frame, {name: make_sensor(each.sensor) for name, each in configs.items()}, points)
     else:

@@ -134,11 +134,11 @@ def test_the_sheet_is_two_abreast():
 
 def test_a_frame_of_a_game_that_needs_no_emulator():
     config = compose(["game=seek", "sensor=constant70"])
-    first, later = show.play(config, 0), show.play(config, 20)
+    first, later = show.walk(config, 0), show.walk(config, 20)
     assert first.shape == (80, 80)
     assert first.max() == 1
     assert not np.array_equal(first, later)
-    np.testing.assert_array_equal(later, show.play(config, 20))
+    np.testing.assert_array_equal(later, show.walk(config, 20))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from foajax.runs.agents import load_agent
 from foajax.runs.status import newest_checkpoint
 from foajax.viewing import heatmap
 from foajax.viewing.heatmap import HeatMap
-from foajax.viewing.recording import play, progress_bar
+from foajax.viewing.recording import progress_bar, watch
 
 PAGE = "index.html"
 
@@ -206,7 +206,7 @@ def _make_map(run: RunData, episodes: int) -> HeatMap | None:
     try:
         stored = load_agent(run.path, trust=True)  # as `read_run` was told
         with progress_bar() as bar:
-            games = play(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
+            games = watch(stored, bar, episodes=episodes, seed=0, greedy=False, max_steps=None)
             heat = heatmap.heat_map([game._replace(images=()) for game in games])
     except ConfigError as error:
         note(f"no heat map: {error}")

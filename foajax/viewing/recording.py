@@ -238,7 +238,7 @@ def _gray(screen: np.ndarray) -> np.ndarray:
     return np.repeat(screen[..., None], 3, axis=-1)
 
 
-def play(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
+def watch(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
     """`record`, with a bar for each game while it is played."""
 
     def progress(steps: int, score: float) -> None:
