@@ -220,7 +220,7 @@ class SearchConfig(Section):
         False, description="Train on scenes with several targets first, one fewer per right answer, two more per wrong."
     )
     absent: bool = Field(False, description="Half of the scenes have no target, and one more answer says so.")
-    classes: Literal[2, 4] = Field(2, description="Ways that the target may point, and answers.")
+    classes: Literal[2, 4] = Field(4, description="Ways that the target may point, and answers.")
     max_fixations: int = Field(
         30, ge=1, le=10_000, description="Decisions after which an episode ends as with a wrong answer."
     )

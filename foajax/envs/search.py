@@ -13,8 +13,8 @@ staircase (Kaernbach 1991), which settles where two of three answers are right, 
 
 Action 0 waits. Each decision costs `search.price`. An answer ends the episode: 1 if it is right, -1 if not; so does
 the `search.max_fixations`-th decision, which counts as a wrong answer where it only waits. Full sight earns
-`optimal_return`. Nobody who sees nothing can earn more than 0 on average: one answer at once, whichever, is right half
-of the time (with four classes less often).
+`optimal_return`. One answer at once, whichever, is right a quarter of the time and earns -0.5 on average; with two
+classes, or where half of the scenes have no target, nobody who sees nothing can earn more than 0.
 """
 
 from __future__ import annotations
