@@ -36,13 +36,16 @@ $(STAMP): pyproject.toml requirements.lock | $(BIN)/python
 train: $(STAMP)
 	$(BIN)/python -m foajax.train $(ARGS)
 
+PYTEST := JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal
+
 test: $(STAMP)
-	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m 'not slow' $(TEST_ARGS)
+	$(PYTEST) -m 'not slow' $(TEST_ARGS)
 
 test-slow: $(STAMP)
-	JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m slow $(TEST_ARGS)
+	$(PYTEST) -m 'slow and not long' $(TEST_ARGS)
 
 test-all: test test-slow
+	$(PYTEST) -m long $(TEST_ARGS)
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -74,6 +74,7 @@ def test_a_training_that_fails_is_shown_and_no_file_of_others_is_touched(tmp_pat
     assert capsys.readouterr().err == "why\n" and (tmp_path / "log").read_text() == "the user's"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_thirty_minutes_end_as_they_began():
     subprocess.run([sys.executable, SCRIPT, "minutes=30"], cwd=SCRIPT.parents[1], check=True)

@@ -219,6 +219,7 @@ def test_a_profile_is_of_one_device(tmp_path):
         train(config)
 
 
+@pytest.mark.slow
 def test_a_profile_is_a_trace_and_a_table(tmp_path):
     code, out, err = finish(*TINY, "profile=true", f"run={tmp_path}")
     assert code == 0, err

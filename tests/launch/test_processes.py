@@ -101,6 +101,7 @@ def two(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_four_devices_and_then_two_learn_what_one_learns(one, tmp_path):
     for devices, env_steps in ((4, TWENTY_UPDATES // 2), (2, TWENTY_UPDATES)):
         words = [f"run={tmp_path}", f"train.env_steps={env_steps}", f"train.devices={devices}"]
@@ -113,6 +114,7 @@ def test_two_processes_learn_what_one_learns(one, two):
     assert_same(two, one)
 
 
+@pytest.mark.slow
 def test_two_processes_of_two_devices_learn_what_one_learns(one, tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "2")
     finish(*start_job(2, f"run={tmp_path}", f"train.env_steps={TWENTY_UPDATES}", "train.devices=2"))
@@ -168,7 +170,10 @@ def lose_one(tmp_path, number, *, which):
 HANGS = pytest.param(1, signal.SIGSTOP, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize(("which", "number"), [(1, signal.SIGKILL), (0, signal.SIGKILL), HANGS])
+LOST = pytest.param(1, signal.SIGKILL, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("which", "number"), [LOST, (0, signal.SIGKILL), HANGS])
 def test_a_process_that_is_lost_ends_the_others_with_a_checkpoint(tmp_path, which, number):
     """Process 0 as well, which has the run's directory and starts JAX's coordination service."""
     code, lines = lose_one(tmp_path, number, which=which)

@@ -185,6 +185,7 @@ def train(directory, *words):
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_two_experiments_and_two_seeds(tmp_path):
     (tmp_path / "sweep").mkdir()
     tiny = [*TINY, "gaze=learned", "learner.schedule=constant"]

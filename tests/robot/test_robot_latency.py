@@ -15,6 +15,7 @@ latency = pytest.importorskip("foajax.robot.latency", reason="needs the extra ro
 pytest.importorskip("onnxruntime", reason="needs the extra robot")
 
 
+@pytest.mark.slow
 def test_a_record_for_each_experiment(tmp_path, capsys):
     file = tmp_path / "cost.json"
     words = ["target=onnx", "experiments=constant50_sub2_packed", "repeats=3", f"json={file}", "dtype=float16"]

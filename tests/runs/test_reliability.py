@@ -80,6 +80,7 @@ def test_a_file_that_cannot_be_written_at_the_start_is_one_line(tmp_path, name):
     assert err.startswith(f"foajax: error: run={tmp_path}: cannot be used (") and name in err
 
 
+@pytest.mark.slow
 def test_the_best_so_far_is_kept_over_starts(run):
     steps = Checkpoints(run / "checkpoints", keep=None).steps()
     best = run / "checkpoints" / str(steps[0])  # made so: nothing that comes will be better
@@ -150,6 +151,7 @@ def test_a_full_disk_stops_nothing(small_disk, tmp_path):
     assert load_agent(run).env_steps == newest(run) == rows(run)[-1]["env_steps"]
 
 
+@pytest.mark.slow
 def test_a_run_whose_end_is_not_saved_says_so(run):
     """Something is in the way of the last checkpoint."""
     (run / "checkpoints" / ".12800.new").touch()

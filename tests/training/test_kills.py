@@ -59,12 +59,14 @@ def check(run, told):
     assert not [name for name in os.listdir(run / "checkpoints") if name.startswith(".")]
 
 
+@pytest.mark.slow
 def test_five_kills_cost_what_came_after_the_last_checkpoint(tmp_path):
     told = kill_again_and_again(tmp_path / "run", times=5, seed=0)
     check(tmp_path / "run", told)
     assert told[-1][1] > told[0][1] > 0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_hundred_kills_are_resumed_from_a_hundred_times(tmp_path):
     told = kill_again_and_again(tmp_path / "run", times=100, seed=1)
