@@ -22,16 +22,20 @@ SEEDS = 3  # of each experiment, for a verdict
 NOT_RUN = "not run yet"
 _CHANCE = ", ".join(f"{low} on {game}" for game, (low, _) in REFERENCE.items() if game != "seek")
 RULES = f"""\
-- A score is the mean of 100 whole games of the final policy, unclipped. Ratios are of what a score has above random
-  play: {_CHANCE}.
-- In brackets: {100 * CONFIDENCE:.0f} % intervals by bootstrap over seeds. With one seed they are over its 100 games and
-  say nothing of what another seed would score. What is read from the curve or the heat map of one seed has none.
-- The interval of a ratio goes from the smallest to the largest ratio of what is in the two intervals. So one score is
-  higher than another only where their intervals do not overlap.
-- A claim *holds* where the whole interval is as claimed, and *does not hold* where none of it is; otherwise the runs
-  *cannot tell*. Where a claim is about two pairs, it has to hold for both.
-- This takes {SEEDS} seeds of each experiment. The interval then goes from the worst to the best seed, and of two equal
-  experiments one in 20 would seem better than the other in the way that is claimed. Fewer seeds only *suggest*."""
+- A score is the mean of 100 whole games of the final policy, with unclipped rewards.
+- Before two scores are divided, the score of random play is subtracted from both:
+  {_CHANCE}.
+- Brackets hold {100 * CONFIDENCE:.0f} % intervals by bootstrap over seeds. With one seed, the interval of a score
+  is over its 100 games and says nothing about other seeds. Numbers from the curve or the heat map of one seed have no
+  interval.
+- The interval of a ratio goes from the smallest to the largest ratio of values in the two intervals. So one score
+  counts as higher than another only if their intervals do not overlap.
+- A claim *holds* if the whole interval is within the bounds of the claim. It *does not hold* if the whole interval is
+  outside. Otherwise the runs *cannot tell*. A claim about two pairs has to hold for both.
+- These verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. With {SEEDS}, an interval goes
+  from the worst to the best seed. If two experiments were equal, the one that is claimed to be better would still seem
+  so by chance in one comparison of 20.
+- *{NOT_RUN.capitalize()}* means that a run which the claim needs is missing."""
 
 
 class Game(NamedTuple):
@@ -203,102 +207,105 @@ CLAIMS = (
     Claim(
         "Lower resolution at 50x50 hurts",
         "lowering the resolution for a 50 × 50 focal area deteriorates performance",
-        "Score of `constant50_sub1` over `constant50_sub2`: above 1.",
+        "Score of `constant50_sub1` divided by that of `constant50_sub2`: above 1.",
         *(1.0, math.inf, _scores(("constant50_sub1", "constant50_sub2"))),
     ),
     Claim(
         "70x70 at half resolution beats 50x50 at full, with half the pixels",
         "the *Constant 70x70, sub2* model outperforms the *Constant 50x50, sub1* model even though only approximately "
         "half the amount of pixels are visible to the agent",
-        "Score of `constant70` over `constant50_sub1`: above 1.",
+        "Score of `constant70` divided by that of `constant50_sub1`: above 1.",
         *(1.0, math.inf, _scores(("constant70", "constant50_sub1"))),
     ),
     Claim(
         "Decreasing resolution is about equal to constant",
         "The performances of the two models are quite similar",
-        "Score of `decreasing` over `constant70`: 0.8 to 1.25.",
+        "Score of `decreasing` divided by that of `constant70`: 0.8 to 1.25.",
         *(0.8, 1.25, _scores(("decreasing", "constant70"))),
     ),
     Claim(
         "The outer ring helps",
         "the low resolution outer focal area does add valuable information to the model",
-        "Score of `decreasing` over `constant50_sub1`: above 1.",
+        "Score of `decreasing` divided by that of `constant50_sub1`: above 1.",
         *(1.0, math.inf, _scores(("decreasing", "constant50_sub1"))),
     ),
     Claim(
         "The periphery improves the score",
         "When the peripheral is added to the two previously mentioned RoI layers the performance is improved.",
-        "Score of `constant70_p` over `constant70`, and of `decreasing_p` over `decreasing`: above 1.",
+        "Score of `constant70_p` divided by that of `constant70`, and `decreasing_p` by `decreasing`: above 1.",
         *(1.0, math.inf, _scores(*_PERIPHERY)),
     ),
     Claim(
         "The periphery makes learning faster",
         "both the *Constant(P) 70x70, sub2* model and the *Decreasing(P) 30-50-70* model are faster to train than "
         "their counterparts",
-        "Mean score over the whole training, the same pairs: above 1.",
+        "Mean score over the whole training, `constant70_p` divided by `constant70`, and `decreasing_p` by "
+        "`decreasing`: above 1.",
         *(1.0, math.inf, _training(1.0, *_PERIPHERY)),
     ),
     Claim(
         "A fifth of the pixels is enough",
         "we can reduce the image data by a factor of 5 while still achieving similar game performance",
-        "Score of `constant70_p` (1241 values) over `nonfoa` (6400): above 0.8.",
+        "Score of `constant70_p` (1241 values) divided by that of `nonfoa` (6400 values): above 0.8.",
         *(0.8, math.inf, _scores(("constant70_p", "nonfoa"))),
     ),
     Claim(
         "Learning takes about 5 times longer",
         "The learning of the two policies took approx. 5 times longer",
-        "Steps that `constant70_p` takes over those of `nonfoa`, to the lower of the scores that both end with: 2.5 to "
-        "10.",
+        "Training steps of `constant70_p` divided by those of `nonfoa`, each until the lower of the two final scores: "
+        "2.5 to 10.",
         *(2.5, 10.0, _longer("constant70_p", "nonfoa")),
     ),
     Claim(
         "A gaze slows the first learning",
         "the addition of the focus-of-attention algorithm generally deteriorates performance, particularly during the "
         "initial episodes",
-        "Mean score over the first tenth of the training, `constant70` over `nonfoa`: below 1.",
+        "Mean score over the first tenth of the training, `constant70` divided by `nonfoa`: below 1.",
         *(-math.inf, 1.0, _training(0.1, ("constant70", "nonfoa"))),
     ),
     Claim(
         "The gaze stays in the lower half",
         "the focal point is mostly kept centered at the bottom half of the screen",
-        "Share of the decisions with the focal point below the middle, `constant70` and `decreasing_p`: above 0.5.",
+        "Share of the decisions that have the focal point below the frame's middle, of `constant70` and of "
+        "`decreasing_p`: above 0.5.",
         *(0.5, math.inf, _gaze("share_below", "Share below the middle")),
     ),
     Claim(
         "The gaze moves little",
         "the agent does not move its focal point very much",
-        "Spread of the focal point over that of one which is everywhere within its bounds, `constant70` and "
-        "`decreasing_p`: below 0.5. The bounds are narrow, 11x11 pixels, as the 70x70 window stays inside the frame.",
+        "Spread of the focal point divided by that of a gaze which is everywhere within its bounds equally often, of "
+        "`constant70` and of `decreasing_p`: below 0.5. The bounds are narrow, 11x11 pixels, because the 70x70 window "
+        "stays inside the frame.",
         *(-math.inf, 0.5, _gaze("relative_spread", "Relative spread")),
     ),
     Claim(
         "Without gaze control it is much worse",
         "without the gaze control and only a low-resolution image the performance was much worse",
-        "Score of `constant70_p` with its gaze frozen in the centre over the learned one's: below 0.5.",
+        "Score of `constant70_p` with its gaze frozen in the centre, divided by that with a learned gaze: below 0.5.",
         *(-math.inf, 0.5, _scores(("constant70_p-frozen", "constant70_p"))),
     ),
     Claim(
         "A learned gaze beats a random one",
         None,
-        "Score of `constant70_p` over that with a random gaze: above 1.",
+        "Score of `constant70_p` divided by that with a random gaze: above 1.",
         *(1.0, math.inf, _scores(("constant70_p", "constant70_p-random"))),
     ),
     Claim(
         "A learned gaze beats a scripted one",
         None,
-        "Score of `constant70_p` over that with a gaze that follows a fixed path: above 1.",
+        "Score of `constant70_p` divided by that with a gaze that follows a fixed path: above 1.",
         *(1.0, math.inf, _scores(("constant70_p", "constant70_p-scripted"))),
     ),
     Claim(
         "Packed values score no less than the paper's canvas",
         None,
-        "Score of `constant70_p` over the same on an 80x80 canvas: above 0.8.",
+        "Score of `constant70_p` (packed) divided by that of the same sensor with an 80x80 canvas: above 0.8.",
         *(0.8, math.inf, _scores(("constant70_p", "constant70_p, canvas"))),
     ),
     Claim(
         "A log-polar retina scores no less than squares of as many values",
         None,
-        "Score of `logpolar` over `constant70` (1225 values each): above 0.8.",
+        "Score of `logpolar` divided by that of `constant70` (1225 values each): above 0.8.",
         *(0.8, math.inf, _scores(("logpolar", "constant70"))),
     ),
 )

@@ -119,30 +119,33 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
 
 
 _INTRODUCTION = """\
-The paper's seven sensors on its three games, with controls that it does not show. `foajax reproduce` makes the runs.
-`foajax keep` keeps them and writes this page; no figure on it is written by hand.
-[What each sensor is](experiments.md)."""
+This page compares the paper's seven sensors on its three games, and adds controls that the paper does not show.
+`foajax reproduce` makes the runs. `foajax keep` keeps them and writes this page, so no figure on it is written by hand.
+[Compare sensors](experiments.md) says what each sensor is."""
 
 _SENSORS = """\
 ## What the sensors show (Figs. 5 and 6)
-Left the frame with the focal area and the focal point, right what the sensor gives, put back in its place.
+Left: the frame with the focal area and the focal point. Right: what the sensor gives, drawn at its place in the frame.
 
 ![Constant: two places of the gaze](results/constant.png)
 
 ![Decreasing(P): two places of the gaze](results/decreasing_p.png)
 
-Drawn by `foajax show sensor=constant70 points=[[35,35],[45,45]] out=docs/results/constant.png`, and the same with
-`decreasing_p`."""
+`foajax show sensor=constant70 points=[[35,35],[45,45]] out=docs/results/constant.png` drew the first figure, the same
+command with `decreasing_p` the second."""
 
 
 _PROTOCOL = """\
 ## How the runs were made
-The default learner for 3,000,000 decisions (Pong 1,500,000) of 4 frames each, the packed layout where a sensor has one.
-100 whole games of the final policy, actions sampled, give the score. A point of a curve is the mean of the last 100
-games of training, with no other smoothing; 500 points of each curve are kept. Where there are several seeds, thin lines
-are seeds, the thick line is their mean, and the band its 95 % interval by bootstrap over seeds. Core hours are hours
-times cores; other work on the machine lengthens them. Commands, commits and machines of all runs:
-[results/runs](../results/runs/README.md)."""
+- **Training**: the default learner, 3,000,000 decisions (Pong 1,500,000) of 4 frames each. A sensor that has a packed
+  layout uses it.
+- **Score**: 100 whole games of the final policy, with sampled actions.
+- **Curves**: each point is the mean of the last 100 games of training, with no other smoothing. 500 points of each
+  curve are kept. With several seeds, thin lines are seeds, the thick line is their mean, and the band is the mean's
+  95 % interval by bootstrap over seeds.
+- **Core hours**: hours times cores. Other work on the machine lengthens them.
+
+[results/runs](../results/runs/README.md) has commands, commits and machines of all runs."""
 
 
 def _protocol(runs: Sequence[RunData]) -> str:
@@ -204,8 +207,10 @@ def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
 
 _COLUMNS = ["agent", "pixel values", "seeds", "score", "of `nonfoa`", "MFLOP", "ms alone", "ms of 32", "core hours"]
 _SCORES = """\
-Score: mean of 100 games [95 %], over seeds or else over the games; of `nonfoa`: the ratio of what is above random play.
-A decision's MFLOP and its time on a CPU, alone and as one of 32 at once: [cost.json](../results/bench/cost.json)."""
+- **score**: mean of 100 games, in brackets its 95 % interval over seeds, or over the games where there is one seed.
+- **of `nonfoa`**: ratio of the scores, each less that of random play.
+- **MFLOP, ms alone, ms of 32**: arithmetic of one decision, and its time on a CPU, alone and as one of 32 at once
+  ([cost.json](../results/bench/cost.json))."""
 
 
 def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:

@@ -63,7 +63,9 @@ def find_runs(directories: Sequence[str | os.PathLike[str]]) -> list[Path]:
     found: set[Path] = set()
     for directory in directories:
         if not os.path.isdir(directory):
-            raise refuse(str(directory), accepted="a directory with runs")
+            raise refuse(
+                str(directory), accepted="a directory with runs, as foajax train writes them", why="is no directory"
+            )
         for parent, below, _ in os.walk(directory):
             if is_run(Path(parent)):
                 found.add(Path(parent))
