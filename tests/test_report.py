@@ -220,7 +220,7 @@ def test_a_heat_map_that_was_made_on_purpose_is_not_overwritten(tmp_path, monkey
     run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0, 2.0, 3.0])
     store_map(run, dataclasses.replace(CURRENT, **change))
     monkeypatch.setattr(report_page, "load_agent", lambda path, trust: None)
-    monkeypatch.setattr(report_page, "play", lambda *_, **__: iter(()))
+    monkeypatch.setattr(report_page, "watch", lambda *_, **__: iter(()))
     monkeypatch.setattr(heatmap, "heat_map", lambda recordings: CURRENT)
     before = heatmap.read(run / "render" / heatmap.FILE).to_json()
     assert report_page.find_maps(groups.games_of([curves.read_run(run)], None), 1)[run] is CURRENT

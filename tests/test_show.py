@@ -87,7 +87,7 @@ def test_the_heading_counts_values():
 def still(monkeypatch):
     """A frame without a game."""
     played = []
-    monkeypatch.setattr(show, "play", lambda config, steps: played.append((config.game, config.seed, steps)) or FRAME)
+    monkeypatch.setattr(show, "walk", lambda config, steps: played.append((config.game, config.seed, steps)) or FRAME)
     return played
 
 
