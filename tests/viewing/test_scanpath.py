@@ -20,7 +20,7 @@ def searched(untrained):
     """An episode of some fixations, by an agent that has learned nothing."""
     words = ["experiment=search_rings", "network.lstm=16", "network.dense=16", "gaze=random"]
     words += ["gaze.step=[20,40,80]", "gaze.actions=9", "gaze.bounds=fovea"]
-    stored = untrained(Agent(compose(words), num_actions=3, crop_top=None))
+    stored = untrained(Agent(compose(words), num_actions=5, crop_top=None))
     return next(r for r in record(stored, episodes=50) if len(r.score) >= 5)
 
 
