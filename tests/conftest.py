@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
 
@@ -22,6 +23,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled programs between test runs: most of the time of a first run is compilation."""
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as behind a shell's `&`; what is ignored is inherited
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +35,7 @@ def no_process_is_left():
         process = processes.STARTED.pop()
         if process.poll() is None:
             process.kill()
+            process.communicate()  # closes its pipes: what is collected later is a later test's warning
 
 
 @pytest.fixture(scope="session")
