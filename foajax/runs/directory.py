@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -204,7 +205,8 @@ def check_same_run(path: Path, config: Config) -> None:
     keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
     if keys:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
-        remedy = "choose another run=<dir> or restore the value"
+        words = shlex.join(f"{key}={_show(stored[key])}" for key in keys if key in stored)
+        remedy = f"choose another run=<dir>, or go on with {words}"
         if keys[0] == "train.env_steps":
             remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
         raise refuse(keys[0], new, "", why=f"the run in {path} has {old}; {remedy}", kind=RunError)
