@@ -202,10 +202,11 @@ def check_same_run(path: Path, config: Config) -> None:
         return
     # With a falling learning rate the length of the run is part of what a step learns.
     free = FREE - {"train.env_steps"} if config.learner.schedule == "linear" else FREE
-    keys = [k for k in [*asked, *stored] if asked.get(k) != stored.get(k) and k not in free]
+    keys = [k for k in dict.fromkeys([*asked, *stored]) if asked.get(k) != stored.get(k) and k not in free]
     if keys:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
-        words = shlex.join(f"{key}={_show(stored[key])}" for key in keys if key in stored)
+        still = FREE if stored["learner.schedule"] == "constant" else ()
+        words = shlex.join(f"{key}={_show(stored[key])}" for key in keys if key in stored and key not in still)
         remedy = f"choose another run=<dir>, or go on with {words}"
         if keys[0] == "train.env_steps":
             remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
