@@ -33,8 +33,9 @@ def keep(arguments: Sequence[str]) -> None:
         raise refuse(str(kept.KEPT), accepted="a checkout, which has kept runs", why="is missing")
     if options.run is not None:
         print(kept.keep(Path(options.run), options.name))
-    kept.write_table()
-    results.write()
+    runs = kept.runs()
+    kept.write_table(runs)
+    results.write(runs)
     bench.write_table()
 
 

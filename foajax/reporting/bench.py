@@ -11,6 +11,7 @@ from typing import Any
 
 from foajax import cli
 from foajax.config import shipped
+from foajax.reporting.markdown import table
 from foajax.runs.provenance import commit, machine
 
 BENCH = shipped.kept_runs().parent / "bench"
@@ -22,19 +23,23 @@ Each file has its command, commit, machine and date, and under `results` what th
 def write(key: str, path: str, results: Any, command: Sequence[str]) -> None:
     """Writes what `command` has found, with all that is needed to judge and repeat it."""
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    about = {"command": shlex.join(command), "commit": commit(), "date": today, "machine": machine()}
+    about = {
+        "command": shlex.join(command),
+        "commit": commit(),
+        "date": today,
+        "machine": machine(),
+    }
     cli.write_json(key, path, {**about, "results": results})
 
 
 def write_table(directory: Path = BENCH) -> None:
     """Makes the table of all measurements anew."""
-    lines = ["| file | date | commit | machine | command |", "|---|---|---|---|---|"]
+    rows = []
     for file in sorted(directory.glob("*.json")):
         found = json.loads(file.read_text())
         where = found["machine"]
         note = f", {where['note']}" if "note" in where else ""
-        lines.append(
-            f"| [{file.stem}]({file.name}) | {found['date']} | {found['commit'][:7]} "
-            f"| {where['cores']} cores, {where['cpu']}{note} | `{found['command']}` |"
-        )
-    (directory / "README.md").write_text("\n".join([_INTRO, *lines, ""]))
+        cores = f"{where['cores']} cores, {where['cpu']}{note}"
+        rows.append([f"[{file.stem}]({file.name})", found["date"], found["commit"][:7], cores, f"`{found['command']}`"])
+    head = ["file", "date", "commit", "machine", "command"]
+    (directory / "README.md").write_text(f"{_INTRO}\n{table(head, rows)}\n")

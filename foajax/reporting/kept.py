@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import yaml
 from foajax.config import shipped
 from foajax.config.parse import refuse, replace, to_mapping
 from foajax.reporting.curves import RunData, read_run
+from foajax.reporting.markdown import table
 from foajax.runs.rows import parse_row
 from foajax.runs.status import newest_checkpoint
 from foajax.sensors.registry import make_sensor
@@ -77,9 +79,19 @@ def _facts(run: RunData, newest: int) -> dict[str, Any]:
     }
 
 
+def runs(directory: Path = KEPT) -> list[RunData]:
+    """All kept runs."""
+    return [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
+
+
+def record(run: RunData) -> dict[str, Any]:
+    """Command, commits, seed, machine and hours of a kept run."""
+    return json.loads((run.path / "run.json").read_text())
+
+
 def row(run: RunData) -> list[str]:
     """A line of the table."""
-    facts, score = json.loads((run.path / "run.json").read_text()), run.evaluation or {}
+    facts, score = record(run), run.evaluation or {}
     values = make_sensor(run.config.sensor).count(run.config.env.frame_shape).nominal
     return [
         run.config.game,
@@ -94,15 +106,12 @@ def row(run: RunData) -> list[str]:
     ]
 
 
-def write_table(directory: Path = KEPT) -> None:
-    """Makes the table of all kept runs anew."""
-    runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
+def write_table(runs: Sequence[RunData], directory: Path = KEPT) -> None:
+    """Makes the table of kept runs anew."""
     head = ["game", "experiment", "seed", "values", "gaze", "env_steps", "hours", "score", "kept in"]
-    lines = [head, ["---"] * len(head), *map(row, runs)]
     intro = (
         "Score: mean and standard error over 100 whole games, unclipped, sampled policy, of the last checkpoint. Each\n"
         "`run.json` has the command, the commit and the machine. [What they say](../../docs/results.md). Made by\n"
         "`python -m foajax.keep`."
     )
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table}\n")
+    (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table(head, map(row, runs))}\n")

@@ -15,10 +15,11 @@ from PIL import Image
 
 from foajax.config import shipped
 from foajax.config.parse import refuse
-from foajax.reporting import claims
+from foajax.reporting import claims, kept
 from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
-from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, read_run
+from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves
 from foajax.reporting.groups import PRESETS, differing_keys, games_of
+from foajax.reporting.markdown import table
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import heatmap
 
@@ -40,13 +41,12 @@ _AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")
 BLOCK = re.compile(r"(<!-- results: [^>]*-->\n).*?(<!-- /results -->)", re.DOTALL)
 
 
-def read(directory: Path) -> dict[str, Game]:
+def by_game(runs: Sequence[RunData]) -> dict[str, Game]:
     """Kept runs by game; `time` is in core seconds.
 
     Raises:
       ConfigError: runs of a game that are compared differ in more than sensor, gaze and seed.
     """
-    runs = [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
     games = {}
     for name, groups in games_of(runs, None).items() if runs else ():
         if name not in GAMES:
@@ -66,15 +66,11 @@ def _label(run: RunData) -> str:
 
 
 def _in_core_time(run: RunData) -> RunData:
-    return run._replace(time=run.time * _facts(run)["cores"])
-
-
-def _facts(run: RunData) -> dict[str, Any]:
-    return json.loads((run.path / "run.json").read_text())
+    return run._replace(time=run.time * kept.record(run)["cores"])
 
 
 def _heat(run: RunData) -> heatmap.HeatMap | None:
-    return heatmap.of_run(run.path, _facts(run)["env_steps"])
+    return heatmap.of_run(run.path, kept.record(run)["env_steps"])
 
 
 def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
@@ -149,7 +145,7 @@ _PROTOCOL = """\
 
 
 def _protocol(runs: Sequence[RunData]) -> str:
-    facts = [_facts(run) for run in runs]
+    facts = [kept.record(run) for run in runs]
 
     def each(values: Iterable[str]) -> str:
         return ", ".join(sorted(set(values)))
@@ -247,11 +243,6 @@ def _cost(record: Mapping[str, Any] | None) -> list[str]:
     return [f"{record['decision_flops'] / 1e6:.1f}", f"{alone:.2f}", f"{together:.2f}"]
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
-
-
 def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str | None:
     """What the README shows: Breakout, the whole frame and a gaze moved in several ways; None before it was run."""
     game = games.get("breakout", Game("breakout", {}))
@@ -292,9 +283,9 @@ def _save(figure: Figure, file: Path) -> None:
     Image.open(content).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
-def write(root: Path = ROOT) -> None:
-    """Makes docs/results.md, its figures and the README's block anew from `results/` of a checkout."""
-    games = read(root / "results" / "runs")
+def write(runs: Sequence[RunData], root: Path = ROOT) -> None:
+    """Makes docs/results.md, its figures and the README's block of a checkout anew from its kept runs."""
+    games = by_game(runs)
     costs = json.loads((root / "results" / "bench" / "cost.json").read_text())["results"]
     (root / "docs" / "results").mkdir(exist_ok=True)
     draw(games, root / "docs" / "results")

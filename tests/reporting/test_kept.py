@@ -80,7 +80,7 @@ def test_a_run_is_kept_by_game_experiment_and_seed(run):
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 500
     assert json.loads((out / "run.json").read_text())["command"] == "python -m foajax.train experiment=seek seed=3"
     assert heatmap.of_run(out, 2000).games == 2
-    kept.write_table(kept.KEPT)
+    kept.write_table(kept.runs(kept.KEPT), kept.KEPT)
     table = (kept.KEPT / "README.md").read_text()
     assert "| seek | `seek` | 3 | 281 | learned | 0.0 M | 0.0 | 9.0 ± 0.5 | [seek/seek-s3](seek/seek-s3) |" in table
 

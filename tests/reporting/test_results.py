@@ -11,7 +11,7 @@ import yaml
 
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, to_mapping
-from foajax.reporting import claims, curves, results
+from foajax.reporting import claims, curves, kept, results
 from foajax.reporting.claims import CLAIMS, Game, ask
 from foajax.reporting.curves import RunData
 from foajax.reporting.scores import Interval
@@ -195,7 +195,7 @@ def checkout(tmp_path):
 
 
 def test_the_page_and_the_readme_of_some_runs(checkout):
-    results.write(checkout)
+    results.write(kept.runs(checkout / "results/runs"), checkout)
     page, readme = (checkout / "docs/results.md").read_text(), (checkout / "README.md").read_text()
     assert "| `constant70_p` | 1,241 | 1 | 100" in page and "| 7.5 | 0.35 | 0.15 | 2.4 |" in page  # 1.2 hours, 2 cores
     assert "| `decreasing` |  |  | not run yet |" in page and "## Pong\nNot run yet." in page
@@ -214,17 +214,17 @@ def test_without_runs_the_readme_stays(checkout):
 def test_runs_of_another_kind_are_not_compared(checkout):
     keep_run(checkout / "results/runs", ["game=breakout", "experiment=decreasing_packed", "learner.num_epochs=3"], 50)
     with pytest.raises(ConfigError, match="decreasing_packed-s0.*the same learner.num_epochs as in"):
-        results.read(checkout / "results/runs")
+        results.by_game(kept.runs(checkout / "results/runs"))
 
 
 def test_runs_of_another_length_are_not_compared(checkout):
     keep_run(checkout / "results/runs", ["game=breakout", "experiment=decreasing_packed"], 50, steps=9_000_000)
     with pytest.raises(ConfigError, match="decreasing_packed-s0: is of 9,000,000 env_steps; accepted is 3,000,000, as"):
-        results.read(checkout / "results/runs")
+        results.by_game(kept.runs(checkout / "results/runs"))
 
 
 def test_the_page_in_the_repository_is_what_its_runs_say():
-    games = results.read(results.ROOT / "results/runs")
+    games = results.by_game(kept.runs(results.ROOT / "results/runs"))
     costs = json.loads((results.ROOT / "results/bench/cost.json").read_text())["results"]
     assert (results.ROOT / "docs/results.md").read_text() == results.page(games, costs)
     text, readme = results.block(games, costs), (results.ROOT / "README.md").read_text()
