@@ -165,6 +165,11 @@ class GazeConfig(Section):
             raise refuse("path", self.path, "at least one [y, x] where gaze.mode=scripted")
 
     @property
+    def sense_bounds(self) -> Literal["window", "point"]:
+        """`bounds` as sensing has them: where less than the whole area stays inside the frame, it may overhang."""
+        return "window" if self.bounds == "window" else "point"
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """The step sizes, frame pixels, smallest first."""
         return (self.step,) if isinstance(self.step, int) else self.step

@@ -213,8 +213,7 @@ class Agent:
 
     def sense(self, frame: Num[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
         """The sensor's images of each frame, [B, h, w, 1]."""
-        bounds = "window" if self.config.gaze.bounds == "window" else "point"
-        look = functools.partial(sense, sensor=self.sensor, bounds=bounds)
+        look = functools.partial(sense, sensor=self.sensor, bounds=self.config.gaze.sense_bounds)
         return jax.vmap(look)(frame, focal_point)
 
     def side(

@@ -130,13 +130,13 @@ class Eye:
         seen = self._see(self._image(observation)[None], self.focal_point[i : i + 1])
         return self._rest(observation) | {name: value[0] for name, value in seen.items()}
 
-    def _see(self, images: np.ndarray, points: np.ndarray) -> dict[str, np.ndarray]:
-        frames = self._pixels.frames(images)
+    def _see(self, observed: np.ndarray, points: np.ndarray) -> dict[str, np.ndarray]:
+        frames = self._pixels.frames(observed)
         if len(frames) != len(points):
             accepted = f"all {len(points)} environments at each step, so batch_size=num_envs and no reset_mask"
             raise refuse("observation", f"{len(frames)} environments", accepted)
-        bounds = "window" if self._gaze.bounds == "window" else "point"
-        seen = self._named([self._pixels.finish(image) for image in self._seeing.look(frames, points, bounds)])
+        images = self._seeing.look(frames, points, self._gaze.sense_bounds)
+        seen = self._named([self._pixels.finish(image) for image in images])
         seen["focal_point"] = gazes.to_unit(points, self._pixels.frame_shape).astype(np.float32)
         return seen
 

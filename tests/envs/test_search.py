@@ -13,6 +13,7 @@ from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
 from foajax.config.schema import Config
 from foajax.envs import glyphs, search
+from foajax.envs import scenes as scenery
 from foajax.envs import tasks as jax_envs
 from foajax.envs.make import action_names, make
 from foajax.envs.own import OWN
@@ -127,11 +128,11 @@ def test_fixations_are_places_and_not_decisions():
 
 def plates(state, episode: int) -> list[tuple[int, int]]:
     """Upper left pixels of the plates of a scene without noise or clutter, found by flood filling."""
-    lit = state.scene[episode] != search.BACKGROUND
+    lit = state.scene[episode] != scenery.BACKGROUND
     found = []
-    for cell_y in range(0, 160, search.CELL):
-        for cell_x in range(0, 160, search.CELL):
-            ys, xs = np.nonzero(lit[cell_y : cell_y + search.CELL, cell_x : cell_x + search.CELL])
+    for cell_y in range(0, 160, scenery.CELL):
+        for cell_x in range(0, 160, scenery.CELL):
+            ys, xs = np.nonzero(lit[cell_y : cell_y + scenery.CELL, cell_x : cell_x + scenery.CELL])
             if len(ys):
                 # A letter's black pixels may have the background's gray level, a plate's rim has not.
                 assert (ys.max() - ys.min(), xs.max() - xs.min()) == (glyphs.PLATE - 1, glyphs.PLATE - 1)
@@ -156,9 +157,9 @@ def test_letters_do_not_overlap_and_are_as_many_as_the_set_size(target):
 def test_places_are_anywhere_in_the_frame():
     corners = scenes(episodes=2000).boxes[:, 0, :2]
     assert corners.min() == 0 and corners.max() == 146
-    cells, counts = np.unique(corners // search.CELL, axis=0, return_counts=True)
+    cells, counts = np.unique(corners // scenery.CELL, axis=0, return_counts=True)
     assert len(cells) == 64 and np.abs(counts - 2000 / 64).max() < 5 * np.sqrt(2000 / 64)
-    assert set(np.unique(corners % search.CELL)) == set(range(7))
+    assert set(np.unique(corners % scenery.CELL)) == set(range(7))
 
 
 def letter_at(scene: np.ndarray, corner) -> tuple[str, int]:
@@ -214,7 +215,7 @@ def test_a_cued_episode_shows_the_cue_and_then_the_scene():
     task = search.search(configured("search.target=cued"))
     state = task.start(jax.random.key(5))
     first = np.asarray(task.draw(state))
-    assert (first[:70] == search.BACKGROUND).all() and (first[73:87, 73:87] > 200).any()
+    assert (first[:70] == scenery.BACKGROUND).all() and (first[73:87, 73:87] > 200).any()
     after, reward, is_over = task.advance(state, jnp.int32(0), jnp.array([80, 80]))
     np.testing.assert_array_equal(task.draw(after), state.scene)
     assert reward == np.float32(-0.01) and not is_over
