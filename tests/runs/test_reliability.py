@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
@@ -9,6 +10,7 @@ import re
 import shutil
 import signal
 import subprocess
+import time
 
 import jax
 import numpy as np
@@ -132,12 +134,15 @@ def test_a_full_disk_stops_nothing(small_disk, tmp_path):
     with log.open("w") as out:
         process = start(*SEEK, f"run={run}", *words, stdout=out, stderr=out)
         wait_for(lambda: newest(run), process)
-        with (small_disk / "ballast").open("wb", buffering=0) as ballast:
-            while process.poll() is None:  # until there is no room at all
-                try:
-                    ballast.write(bytes(4096))
-                except OSError:
-                    break
+        stop(process)
+        while any((run / "checkpoints").glob(".*.new")):  # one that is being written would run out of room half-way
+            process.send_signal(signal.SIGCONT)
+            time.sleep(0.1)
+            stop(process)
+        with (small_disk / "ballast").open("wb", buffering=0) as ballast, contextlib.suppress(OSError):
+            while True:  # until there is no room at all
+                ballast.write(bytes(4096))
+        process.send_signal(signal.SIGCONT)
         wait_for(lambda: "was not written: [Errno 28] No space left on device" in log.read_text(), process)
         kept, steps = newest(run), len(log.read_text())
         wait_for(lambda: len(log.read_text()) > steps + 1000, process)  # it goes on
@@ -149,6 +154,11 @@ def test_a_full_disk_stops_nothing(small_disk, tmp_path):
     assert process.returncode == 0
     assert "Traceback" not in log.read_text()
     assert load_agent(run).env_steps == newest(run) == rows(run)[-1]["env_steps"]
+
+
+def stop(process):
+    process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED)
 
 
 @pytest.mark.slow
