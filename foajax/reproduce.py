@@ -2,10 +2,11 @@
 
 Where a gaze is learned, ten more games make its heat map.
 
-`experiments/reproduce.yaml` has the stages. A run that is finished is skipped and one that was stopped goes on, so the
-same command is given again and again until nothing is left. `show=table` says how far each run is; `show=commands`
-prints a command for each run that is left, as for the tasks of a cluster's job array. `python -m foajax.keep
-run=<dir>` keeps a run in results/ and writes what it says to docs/results.md.
+`experiments/plans/paper.yaml` has the stages; `plan=search` takes those of visual search. A run that is finished is
+skipped and one that was stopped goes on, so the same command is given again and again until nothing is left.
+`show=table` says how far each run is; `show=commands` prints a command for each run that is left, as for the tasks of a
+cluster's job array. `python -m foajax.keep run=<dir>` keeps a run in results/ and writes what it says to
+docs/results.md.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
 from pydantic import Field
@@ -29,13 +30,13 @@ from foajax.launch import sweep
 from foajax.runs.directory import is_run
 from foajax.runs.status import inspect, is_finished
 
-_EPISODES = 100  # whole games that a final policy is scored in
-_WATCHED = 10  # and in which its gaze is watched
+_WATCHED = 10  # games in which a learned gaze is watched
 
 
 class Options(Section):
     """What the command takes."""
 
+    plan: Literal["paper", "search"] = Field("paper", description="Which comparison, of experiments/plans/.")
     stage: int | None = Field(None, description="Which stage to run; null for all, one after another.")
     jobs: int = Field(1, ge=1, description="Runs at a time, each with its share of the cores.")
     show: Literal["table", "commands"] | None = Field(
@@ -43,20 +44,21 @@ class Options(Section):
     )
 
     def check(self) -> None:
-        most = len(stages())
+        most = len(load(self.plan)["stages"])
         if self.stage is not None and not 1 <= self.stage <= most:
             raise refuse("stage", self.stage, f"null or an integer from 1 to {most}")
 
 
-def stages() -> list[dict]:
-    """The stages of `experiments/reproduce.yaml`: what each is `about`, and the words of its sweeps."""
-    return yaml.safe_load((shipped.experiments() / "reproduce.yaml").read_text())["stages"]
+def load(plan: str) -> dict[str, Any]:
+    """A plan of `experiments/plans/`: its `stages`, what each is `about` and the words of its sweeps; `episodes`."""
+    return yaml.safe_load((shipped.experiments() / "plans" / f"{plan}.yaml").read_text())
 
 
 def reproduce(arguments: Sequence[str]) -> int:
     """The command; 1 where a run failed."""
     options = cli.parse(Options, arguments)
-    chosen = [stage for i, stage in enumerate(stages(), 1) if options.stage in (None, i)]
+    plan = load(options.plan)
+    chosen = [stage for i, stage in enumerate(plan["stages"], 1) if options.stage in (None, i)]
     planned = [
         (stage["about"], [run for line in stage["runs"] for run in sweep.expand(line.split())]) for stage in chosen
     ]
@@ -71,17 +73,17 @@ def reproduce(arguments: Sequence[str]) -> int:
             )
             continue
         print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
-        failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs)
+        failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs, plan["episodes"])
     return failed
 
 
-def _play(runs: Sequence[sweep.Run], jobs: int) -> int:
+def _play(runs: Sequence[sweep.Run], jobs: int, episodes: int) -> int:
     """Plays the games of finished runs: for their scores, and for heat maps of learned gazes; 1 where that failed."""
     commands = []
     for run in runs:
         where = run.config.run_dir
         if is_finished(run.config) and not _score(run).exists():
-            commands.append(["foajax.evaluate", f"run={where}", f"episodes={_EPISODES}", f"json={_score(run)}"])
+            commands.append(["foajax.evaluate", f"run={where}", f"episodes={episodes}", f"json={_score(run)}"])
         if is_finished(run.config) and run.config.gaze.mode == "learned" and not Path(where, "render").exists():
             commands.append(["foajax.render", f"run={where}", f"episodes={_WATCHED}", "video=false"])
     with ThreadPoolExecutor(jobs) as pool:
@@ -105,7 +107,7 @@ def _show(planned: Sequence[tuple[str, Sequence[sweep.Run]]]) -> int:
                 run.config.run_dir,
                 known.state if known else "not begun",
                 f"{known.env_steps:,}" if known else "",
-                f"{score['mean']:.1f} ± {score['stderr']:.1f}" if score else "",
+                f"{score['mean']:.3g} ± {score['stderr']:.2g}" if score else "",
             )
         table.add_section()
     Console(width=140).print(table)

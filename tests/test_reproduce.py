@@ -21,15 +21,20 @@ SENSORS = {
 def short(tmp_path, monkeypatch):
     """One stage of two short runs of seek, in a directory of the test's."""
     lines = ["experiment=seek seed=0,1 train.env_steps=640 env.num_envs=4 train.log_every=0.1"]
-    monkeypatch.setattr(reproduce, "stages", lambda: [{"about": "a short stage", "runs": lines}])
-    monkeypatch.setattr(reproduce, "_EPISODES", 2)
+    plan = {"episodes": 2, "stages": [{"about": "a short stage", "runs": lines}]}
+    monkeypatch.setattr(reproduce, "load", lambda name: plan)
     monkeypatch.setattr(reproduce, "_WATCHED", 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
+def planned(plan):
+    stages = reproduce.load(plan)["stages"]
+    return [run.config for stage in stages for line in stage["runs"] for run in sweep.expand(line.split())]
+
+
 def test_each_game_has_the_papers_seven_sensors():
-    runs = [run.config for stage in reproduce.stages() for line in stage["runs"] for run in sweep.expand(line.split())]
+    runs = planned("paper")
     for game, steps in (("breakout", 3_000_000), ("pong", 1_500_000), ("beam_rider", 3_000_000)):
         first = [c for c in runs if c.game == game and c.seed == 0 and c.name in SENSORS]
         assert {c.name for c in first} == SENSORS and {c.train.env_steps for c in first} == {steps}

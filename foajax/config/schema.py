@@ -268,6 +268,9 @@ class NetworkConfig(Section):
     last_reward: bool = Field(True, description="The LSTM is told the reward of the step before.")
     forget_bias: float = Field(1.0, ge=-100, le=100, description="Of the LSTM's forget gates, before learning.")
     lstm_norm: bool = Field(True, description="Layer norm of the input's part of the LSTM's gates.")
+    priority_map: bool = Field(
+        False, description="The vision head reads the peripheral grid as a map of where to look."
+    )
     normalization: Literal["pixel", "running", "frame", "none"] = Field(
         "pixel", description="Frames less a mean: of each pixel, of all pixels so far, of one frame, or none."
     )
@@ -391,6 +394,7 @@ class Config(Section):
 
     def check(self) -> None:
         self._check_places()
+        self._check_map()
         self._check_minibatches()
         check_shares(self, self.train.devices, "train.devices", self.train.devices)
         self._check_counters()
@@ -409,6 +413,15 @@ class Config(Section):
         for y, x in self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ()):
             if not (0 <= y < height and 0 <= x < width):
                 raise refuse("gaze.start or gaze.path", (y, x), f"[y, x] inside {frame}")
+
+    def _check_map(self) -> None:
+        """Each cell of the priority map is a place that the gaze can choose."""
+        sensor = self.sensor
+        cells = sensor.peripheral if isinstance(sensor, RingSensor) and sensor.layout == "packed" else None
+        chosen = self.gaze.grid if self.gaze.moves == "absolute" else None
+        if self.network.priority_map and self.gaze.learned and (cells is None or cells != chosen):
+            accepted = "false, or gaze.moves=absolute with gaze.grid=sensor.peripheral and sensor.layout=packed"
+            raise refuse("network.priority_map", True, accepted)
 
     def _check_minibatches(self) -> None:
         count, envs, groups = self.learner.num_minibatches, self.env.num_envs, self.env.num_groups

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import flax.linen as nn
@@ -10,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 
 from foajax.config.schema import Config, NetworkConfig
 from foajax.networks.cores import LSTM, Carry, make_core
-from foajax.networks.torsos import RELU_GAIN, make_torso
+from foajax.networks.torsos import RELU_GAIN, convolution, make_torso
 from foajax.types import NetworkOutput, Params
 
-_SMALLEST_IMAGE = {"small": 12}  # below it, or 8 (a 5x5 periphery), the values go straight to the next layer
+_MAP = 16  # numbers that describe a cell of the priority map
 
 
 class Network(nn.Module):
@@ -48,6 +49,8 @@ class Network(nn.Module):
         vision_logits, vision_value = None, None
         if self.num_vision_actions:
             vision_logits, vision_value = self.head("vision", hidden, self.num_vision_actions)
+            if self.config.priority_map:
+                vision_logits = vision_logits + self.priority(roi[-1], hidden)
         output = NetworkOutput(
             natural_logits=natural_logits,
             natural_value=natural_value,
@@ -60,7 +63,7 @@ class Network(nn.Module):
         """What the torso makes of the sensor's images, concatenated; then the dense layer if there is one."""
         parts = [
             make_torso(self.config, name=f"torso_{i}")(x)
-            if min(x.shape[1:3]) >= _SMALLEST_IMAGE.get(self.config.torso, 8)
+            if min(x.shape[1:3]) >= smallest_image(self.config.torso)
             else x.reshape(x.shape[0], -1)
             for i, x in enumerate(images)
         ]
@@ -72,11 +75,28 @@ class Network(nn.Module):
             features = nn.relu(dense(features))
         return features
 
+    def priority(self, cells: Float[Array, "T B h w C"], hidden: Float[Array, "T B L"]) -> Float[Array, "T B V"]:
+        """What each cell of the peripheral grid adds to the logit of looking there: how well it matches a query.
+
+        The query comes from the memory and is the same for all cells, and so are the weights that read a cell and
+        its neighbours. So what makes a place worth a look is learned once, not once for each place.
+        """
+        steps, batch = hidden.shape[:2]
+        near = nn.relu(convolution(_MAP, (3, 3), padding="SAME", name="map_near")(cells.reshape(-1, *cells.shape[2:])))
+        keys = nn.Dense(_MAP, name="map_keys")(near).reshape(steps, batch, -1, _MAP)
+        query = nn.Dense(_MAP, kernel_init=nn.initializers.orthogonal(0.1), name="map_query")(hidden)
+        return jnp.einsum("tbvk,tbk->tbv", keys, query) / math.sqrt(_MAP)
+
     def head(self, name: str, hidden: Float[Array, "T B L"], actions: int) -> tuple[Array, Array]:
         """Softmax logits and value. Small first logits: every action is about equally likely at the start."""
         logits = nn.Dense(actions, kernel_init=nn.initializers.orthogonal(0.01), name=f"{name}_policy")(hidden)
         value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name=f"{name}_value")(hidden)
         return logits, value[..., 0]
+
+
+def smallest_image(torso: str) -> int:
+    """The sides that an image has at least for `torso` to see it; a smaller one goes straight to the next layer."""
+    return 12 if torso == "small" else 8
 
 
 def make_network(config: Config, num_natural_actions: int) -> Network:

@@ -21,12 +21,12 @@ from onnx import TensorProto, helper, numpy_helper
 from foajax.config.parse import refuse
 from foajax.config.schema import NetworkConfig
 from foajax.learning.agent import Agent
+from foajax.networks.network import smallest_image
 from foajax.types import Params
 
 OPSET = 17  # the first with LayerNormalization; runtimes since 2022 have it
 _IR_VERSION = 8  # of the same year
 _EPSILON = 1e-6  # of Flax's layer norm
-_SMALLEST_IMAGE = 8  # as in `networks`: smaller images go straight to the next layer
 _FLOAT = TensorProto.FLOAT
 
 
@@ -140,7 +140,8 @@ def policy(agent: Agent, params: Params, facts: Mapping[str, str]) -> onnx.Model
     hidden = write_core(graph, config, x, order)
     _head(graph, "natural", hidden)
     if agent.network.num_vision_actions:
-        _head(graph, "vision", hidden)
+        last = f"image_{len(agent.image_shapes) - 1}"
+        _head(graph, "vision", hidden, _priority(graph, last, hidden) if config.priority_map else None)
     if graph.left_over():
         raise refuse("network", accepted="a network as its config.yaml has it", why=f"has {graph.left_over()[0]} too")
     return _model(graph, facts)
@@ -168,7 +169,7 @@ def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> F
     names, orders, start = [], [], 0
     for i, shape in enumerate(shapes):
         name = graph.input(f"image_{i}", shape[2], *shape[:2])
-        if min(shape[:2]) >= _SMALLEST_IMAGE:
+        if min(shape[:2]) >= smallest_image(config.torso):
             name, shape = write_torso(graph, config, f"torso_{i}", name, shape)
         names.append(graph.node("Flatten", f"features_{i}", name, axis=1))
         # ONNX lays channels first, the network had them last: the rows of the next kernel are sorted anew.
@@ -239,6 +240,18 @@ def _impala(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image
     return graph.node("Relu", f"{name}/relu", x), (height, width, channels)
 
 
+def _small(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -> tuple[str, Image]:
+    """`torsos.SmallTorso`."""
+    height, width, channels = shape
+    for layer, kernel in enumerate((4, 3)):
+        below, right = -(height - kernel) % 2, -(width - kernel) % 2
+        channels = graph.channels(f"{name}/Conv_{layer}")
+        x = graph.convolution(f"{name}/Conv_{layer}", x, stride=2, pads=(0, 0, below, right))
+        x = graph.node("Relu", f"{name}/relu_{layer}", x)
+        height, width = (height + below - kernel) // 2 + 1, (width + right - kernel) // 2 + 1
+    return x, (height, width, channels)
+
+
 def _lstm(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str:
     """One step of `cores.LSTM`, with its gates in the order input, forget, candidate, output.
 
@@ -297,14 +310,33 @@ def _projected(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray, *
     return graph.layer_norm(f"{prefix}norm", projected, gates * config.lstm) if config.lstm_norm else projected
 
 
-def _head(graph: Graph, name: str, hidden: str) -> None:
+def _priority(graph: Graph, cells: str, hidden: str) -> str:
+    """What `Network.priority` adds to the logits of the vision head, [batch, cells]."""
+    near = graph.node("Relu", "map_relu", graph.convolution("map_near", cells, pads=(1,) * 4))
+    flat = graph.node("Reshape", "map_flat", near, graph.constant("map_flat.shape", np.array([0, 0, -1])))
+    kernel, bias = graph.take("map_keys/kernel").T, graph.take("map_keys/bias")[:, None]
+    products = graph.node("MatMul", "map_products", graph.constant("map_keys.kernel", kernel), flat)
+    keys = graph.node("Add", "map_keys", products, graph.constant("map_keys.bias", bias))
+    scaled = graph.constant("map_scale", np.array(len(kernel) ** -0.5, np.float32))
+    query = graph.node("Mul", "map_query_scaled", graph.dense("map_query", hidden), scaled)
+    row = graph.node("Unsqueeze", "map_row", query, graph.constant("map_row.axis", np.array([1])))
+    matches = graph.node("MatMul", "map_matches", row, keys)
+    return graph.node("Squeeze", "map", matches, graph.constant("map.axis", np.array([1])))
+
+
+def _head(graph: Graph, name: str, hidden: str, more: str | None = None) -> None:
+    """Logits, to which `more` is added, and value."""
     for part, output in (("policy", "logits"), ("value", "value")):
         kernel, bias = graph.take(f"{name}_{part}/kernel"), graph.take(f"{name}_{part}/bias")
         weights = graph.constant(f"{name}_{part}.kernel", kernel), graph.constant(f"{name}_{part}.bias", bias)
-        graph.node("Gemm", graph.output(f"{name}_{output}", len(bias)), hidden, *weights)
+        given = graph.output(f"{name}_{output}", len(bias))
+        if more and part == "policy":
+            graph.node("Add", given, graph.node("Gemm", f"{name}_{part}", hidden, *weights), more)
+        else:
+            graph.node("Gemm", given, hidden, *weights)
 
 
-TORSOS: dict[str, Torso] = {"nature": _nature, "a3c": _a3c, "impala": _impala}
+TORSOS: dict[str, Torso] = {"nature": _nature, "a3c": _a3c, "impala": _impala, "small": _small}
 # A core makes one step: it takes the value that the images have become, adds an input for each of its states and an
 # output `next_<state>` for each, and gives the value that the heads read.
 CORES: dict[str, Core] = {"lstm": _lstm, "gru": _gru, "mingru": _mingru, "none": _memoryless}

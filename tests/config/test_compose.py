@@ -71,7 +71,7 @@ def test_without_a_word_every_key_has_its_default():
 
 def test_the_experiments_are_the_papers_their_packed_layouts_and_our_own():
     search = [
-        "detect_rings",
+        "detect_rings_p",
         *(f"search_{kind}" for kind in ("full", "logpolar", "rings", "rings_p", "wide", "window")),
     ]
     assert list_experiments() == sorted([*TABLE_II, *PACKED, "logpolar", "seek", *search])

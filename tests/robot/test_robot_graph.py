@@ -34,6 +34,7 @@ NETWORKS = {
     "gru": ["experiment=constant70_packed", "network.core=gru"],
     "mingru": ["experiment=constant70_packed", "network.core=mingru", "network.lstm_norm=false"],
     "no memory": ["experiment=constant70_packed", "network.core=none"],
+    "a priority map": ["experiment=search_rings_p"],
     "told nothing": [
         *("experiment=nonfoa", "network.last_actions=false", "network.last_reward=false"),
     ],
