@@ -27,6 +27,7 @@ from foajax import cli
 from foajax.config import shipped
 from foajax.config.parse import Section, refuse
 from foajax.launch import sweep
+from foajax.reporting import kept
 from foajax.runs.directory import is_run
 from foajax.runs.status import inspect, is_finished
 
@@ -44,21 +45,20 @@ class Options(Section):
     )
 
     def check(self) -> None:
-        most = len(load(self.plan)["stages"])
+        most = len(stages(self.plan))
         if self.stage is not None and not 1 <= self.stage <= most:
             raise refuse("stage", self.stage, f"null or an integer from 1 to {most}")
 
 
-def load(plan: str) -> dict[str, Any]:
-    """A plan of `experiments/plans/`: its `stages`, what each is `about` and the words of its sweeps; `episodes`."""
-    return yaml.safe_load((shipped.experiments() / "plans" / f"{plan}.yaml").read_text())
+def stages(plan: str) -> list[dict[str, Any]]:
+    """The stages of a plan of `experiments/plans/`: what each is `about`, and the words of its sweeps."""
+    return yaml.safe_load((shipped.experiments() / "plans" / f"{plan}.yaml").read_text())["stages"]
 
 
 def reproduce(arguments: Sequence[str]) -> int:
     """The command; 1 where a run failed."""
     options = cli.parse(Options, arguments)
-    plan = load(options.plan)
-    chosen = [stage for i, stage in enumerate(plan["stages"], 1) if options.stage in (None, i)]
+    chosen = [stage for i, stage in enumerate(stages(options.plan), 1) if options.stage in (None, i)]
     planned = [
         (stage["about"], [run for line in stage["runs"] for run in sweep.expand(line.split())]) for stage in chosen
     ]
@@ -73,18 +73,19 @@ def reproduce(arguments: Sequence[str]) -> int:
             )
             continue
         print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
-        failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs, plan["episodes"])
+        failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs)
     return failed
 
 
-def _play(runs: Sequence[sweep.Run], jobs: int, episodes: int) -> int:
+def _play(runs: Sequence[sweep.Run], jobs: int) -> int:
     """Plays the games of finished runs: for their scores, and for heat maps of learned gazes; 1 where that failed."""
     commands = []
     for run in runs:
         where = run.config.run_dir
+        episodes, watched = kept.protocol(run.config)
         if is_finished(run.config) and not _score(run).exists():
             commands.append(["foajax.evaluate", f"run={where}", f"episodes={episodes}", f"json={_score(run)}"])
-        if is_finished(run.config) and run.config.gaze.mode == "learned" and not Path(where, "render").exists():
+        if is_finished(run.config) and watched and not Path(where, "render").exists():
             commands.append(["foajax.render", f"run={where}", f"episodes={_WATCHED}", "video=false"])
     with ThreadPoolExecutor(jobs) as pool:
         codes = pool.map(lambda command: subprocess.call([sys.executable, "-m", *command]), commands)

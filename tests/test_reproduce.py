@@ -21,16 +21,17 @@ SENSORS = {
 def short(tmp_path, monkeypatch):
     """One stage of two short runs of seek, in a directory of the test's."""
     lines = ["experiment=seek seed=0,1 train.env_steps=640 env.num_envs=4 train.log_every=0.1"]
-    plan = {"episodes": 2, "stages": [{"about": "a short stage", "runs": lines}]}
-    monkeypatch.setattr(reproduce, "load", lambda name: plan)
+    monkeypatch.setattr(reproduce, "stages", lambda plan: [{"about": "a short stage", "runs": lines}])
+    monkeypatch.setattr(reproduce.kept, "protocol", lambda config: (2, True))
     monkeypatch.setattr(reproduce, "_WATCHED", 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 def planned(plan):
-    stages = reproduce.load(plan)["stages"]
-    return [run.config for stage in stages for line in stage["runs"] for run in sweep.expand(line.split())]
+    return [
+        run.config for stage in reproduce.stages(plan) for line in stage["runs"] for run in sweep.expand(line.split())
+    ]
 
 
 def test_each_game_has_the_papers_seven_sensors():

@@ -51,8 +51,9 @@ def summarise(facts: Facts) -> dict[str, float]:
     - `accuracy`: share of right answers. `decisions`, `fixations`: how many an episode takes, until the answer.
     - `on_target`: share of the fixations that land on the target, where there is one.
     - `accuracy_8`, `fixations_8`, ...: the same at a set size.
-    - `slope_present`, `slope_absent`: fixations per item of the set, by least squares over the episodes that were
-      answered right; only where set sizes differ.
+    - `fixations_present_8`, `fixations_absent_8`: of the episodes that were answered right, with and without a target.
+      `slope_present`, `slope_absent`: fixations per item of the set, by least squares over them. Only where set sizes
+      differ.
     - `hit_rate`, `distance` (pixels), `overlap` (intersection over union): of the answers "here" (`game=detect`).
     """
     if "set_size" not in facts or not len(facts["set_size"]):
@@ -70,9 +71,11 @@ def summarise(facts: Facts) -> dict[str, float]:
     if len(known) > 1:
         for size in known:
             row |= {f"{name}_{size}": float(facts[key][sizes == size].mean()) for name, key in _MEANS.items()}
-        for name, part in (("slope_present", right & present), ("slope_absent", right & ~present)):
-            if len(np.unique(sizes[part])) > 1:
-                row[name] = float(np.polyfit(sizes[part], facts["fixations"][part], 1)[0])
+        for name, part in (("present", right & present), ("absent", right & ~present)):
+            there = np.unique(sizes[part])
+            row |= {f"fixations_{name}_{n}": float(facts["fixations"][part & (sizes == n)].mean()) for n in there}
+            if len(there) > 1:
+                row[f"slope_{name}"] = float(np.polyfit(sizes[part], facts["fixations"][part], 1)[0])
     pointed = facts["distance"] >= 0
     if pointed.any():
         row["hit_rate"] = float(right[pointed].mean())

@@ -113,12 +113,17 @@ def flops(function: Callable[..., Any], *arguments: Any) -> int:
 
 def count(config: Config) -> dict[str, Any]:
     """What is counted of a run's decision: the same on every machine."""
-    return _subject(config).exact
+    return _count(*_of_shapes(config))
+
+
+def _of_shapes(config: Config) -> tuple[Agent, Params]:
+    """An agent, and the shapes of its parameters in their place."""
+    agent = Agent(config, num_actions=_NUM_ACTIONS, crop_top=None)
+    return agent, jax.eval_shape(agent.initial_params, jax.random.key(0))
 
 
 def _subject(config: Config) -> Subject:
-    agent = Agent(config, num_actions=_NUM_ACTIONS, crop_top=None)
-    shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
+    agent, shapes = _of_shapes(config)
     random = np.random.default_rng(0)
     # The values matter to neither count nor time; initialisation as in training is slow to compile.
     params = jax.tree.map(lambda s: jnp.asarray(random.normal(0, 0.05, s.shape), s.dtype), shapes)

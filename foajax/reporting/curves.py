@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 import re
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from PIL import Image
 
 from foajax.config.parse import refuse
 from foajax.config.schema import Config
@@ -224,3 +226,10 @@ def draw_scores(intervals: Mapping[str, Mapping[str, Interval]], colours: Mappin
             plot.spines["left"].set_visible(False)
         figure.supxlabel(f"interquartile mean of the runs' scores, {100 * CONFIDENCE:.0f} % interval", fontsize=10)
     return figure
+
+
+def save(figure: Figure, file: Path) -> None:
+    """Writes a figure as a PNG of 128 colours, a third of the size."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=120)
+    Image.open(content).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)

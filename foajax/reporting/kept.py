@@ -13,6 +13,7 @@ import yaml
 
 from foajax.config import shipped
 from foajax.config.parse import refuse, replace, to_mapping
+from foajax.config.schema import Config
 from foajax.reporting.curves import RunData, read_run
 from foajax.reporting.markdown import table
 from foajax.runs.rows import parse_row
@@ -32,13 +33,14 @@ def keep(path: Path, name: str | None) -> Path:
     if newest < run.config.train.env_steps:
         why = f"has {newest:,} of its {run.config.train.env_steps:,} env_steps"
         raise refuse("run", path, "a finished run, or one that is given fewer train.env_steps", why=why)
-    wanted = {"env_steps": newest, "policy": "sampled", "episodes": 100}
+    episodes, watched = protocol(run.config)
+    wanted = {"env_steps": newest, "policy": "sampled", "episodes": episodes}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
-        command = f"evaluate run={path} json={path}/score.json"
+        command = f"evaluate run={path} episodes={episodes} json={path}/score.json"
         raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
     heat = heatmap.of_run(path, newest)
-    if heat is None and run.config.gaze.mode == "learned":
+    if heat is None and watched:
         command = f"render run={path} episodes=10 video=false"
         raise refuse("run", path, f"what {command} writes", why="has no heat map of its final policy in render/")
     config = replace(run.config, run=None)
@@ -59,6 +61,13 @@ def keep(path: Path, name: str | None) -> Path:
     (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")
     (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
     return out
+
+
+def protocol(config: Config) -> tuple[int, bool]:
+    """How many episodes a kept score is the mean of, and whether a heat map has to show where the gaze was."""
+    if config.game in ("search", "detect"):  # a scene takes some decisions, and a target may be anywhere in it
+        return 2000, False
+    return 100, config.gaze.mode == "learned"
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:
@@ -93,6 +102,7 @@ def row(run: RunData) -> list[str]:
     """A line of the table."""
     facts, score = record(run), run.evaluation or {}
     values = make_sensor(run.config.sensor).count(run.config.env.frame_shape).nominal
+    digits = 1 if score["stderr"] >= 0.05 else 3  # a scene of search earns 1 at most
     return [
         run.config.game,
         f"`{run.config.name}`",
@@ -101,7 +111,7 @@ def row(run: RunData) -> list[str]:
         run.config.gaze.mode,
         f"{facts['env_steps'] / 1e6:.1f} M",
         f"{facts['hours']:.1f}",
-        f"{score['mean']:.1f} ± {score['stderr']:.1f}",
+        f"{score['mean']:.{digits}f} ± {score['stderr']:.{digits}f}",
         f"[{run.path.parent.name}/{run.path.name}]({run.path.parent.name}/{run.path.name})",
     ]
 
@@ -110,8 +120,8 @@ def write_table(runs: Sequence[RunData], directory: Path = KEPT) -> None:
     """Makes the table of kept runs anew."""
     head = ["game", "experiment", "seed", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     intro = (
-        "Score: mean and standard error over 100 whole games, unclipped, sampled policy, of the last checkpoint. Each\n"
-        "`run.json` has the command, the commit and the machine. [What they say](../../docs/results.md). Made by\n"
-        "`python -m foajax.keep`."
+        "Score: mean and standard error over 100 whole games, unclipped, or over 2,000 scenes of search; sampled\n"
+        "policy of the last checkpoint. Each `run.json` has the command, the commit and the machine.\n"
+        "[What they say](../../docs/results.md). Made by `python -m foajax.keep`."
     )
     (directory / "README.md").write_text(f"# Kept runs\n{intro}\n\n{table(head, map(row, runs))}\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,16 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from PIL import Image
 
 from foajax.config import shipped
 from foajax.config.parse import refuse
-from foajax.reporting import claims, kept
+from foajax.reporting import claims, kept, search
 from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
-from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves
+from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, save
 from foajax.reporting.groups import PRESETS, differing_keys, games_of
-from foajax.reporting.markdown import table
+from foajax.reporting.markdown import fill, table
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import heatmap
 
@@ -38,7 +35,6 @@ FIGURES: dict[str, tuple[str, Mapping[str, str]]] = {  # title, and whose curves
 }
 _COMPARED = {*PAPER_NAMES, *_GAZES, "logpolar", "constant70_p, canvas"}
 _AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")}
-BLOCK = re.compile(r"(<!-- results: [^>]*-->\n).*?(<!-- /results -->)", re.DOTALL)
 
 
 def by_game(runs: Sequence[RunData]) -> dict[str, Game]:
@@ -270,17 +266,10 @@ def draw(games: Mapping[str, Game], directory: Path) -> None:
             if there := {label: shown for label, shown in labels.items() if label in game.runs}:
                 groups = {shown: game.runs[label] for label, shown in there.items()}
                 colours = {there[label]: colour for label, colour in colours_of(there).items()}
-                _save(draw_curves(groups, f"{title}: {what}", colours, _AXES), directory / f"{game.name}-{file}.png")
+                save(draw_curves(groups, f"{title}: {what}", colours, _AXES), directory / f"{game.name}-{file}.png")
         for label in claims.WATCHED:
             if heats := game.heats.get(label):
-                _save(heatmap.draw(heats[0], f"{label} on {title}"), directory / f"{game.name}-heat-{label}.png")
-
-
-def _save(figure: Figure, file: Path) -> None:
-    """As a PNG of 128 colours, a third of the size."""
-    content = io.BytesIO()
-    figure.savefig(content, dpi=120)
-    Image.open(content).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)
+                save(heatmap.draw(heats[0], f"{label} on {title}"), directory / f"{game.name}-heat-{label}.png")
 
 
 def write(runs: Sequence[RunData], root: Path = ROOT) -> None:
@@ -292,4 +281,5 @@ def write(runs: Sequence[RunData], root: Path = ROOT) -> None:
     (root / "docs" / "results.md").write_text(page(games, costs))
     readme = root / "README.md"
     if text := block(games, costs):
-        readme.write_text(BLOCK.sub(lambda found: found[1] + text + found[2], readme.read_text()))
+        readme.write_text(fill(readme.read_text(), text))
+    search.write(runs, root / "docs")

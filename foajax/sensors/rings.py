@@ -137,9 +137,12 @@ def sense_cells(frame: Num[Array, "H W"], sensor: RingSensor) -> Float[Array, "r
     rows, columns = cell_edges(sensor, (height, width))
     if sensor.pooling == "stride":
         return frame[rows[:-1]][:, columns[:-1]].astype(jnp.float32)
-    # Whole columns of the product are contiguous sums; 'highest' keeps accelerators from rounding.
-    means = jnp.einsum("hw,vw->hv", frame.astype(jnp.float32), _averages(columns), precision="highest")
-    return jnp.einsum("hv,uh->uv", means, _averages(rows), precision="highest")
+    frame, size = frame.astype(jnp.float32), int(rows[1])
+    if np.all(np.diff(rows) == size):  # an eighth of the arithmetic of the product
+        means = block_sums(frame, size, 0) / size
+    else:
+        means = jnp.einsum("hw,uh->uw", frame, _averages(rows), precision="highest")  # keeps accelerators from rounding
+    return jnp.einsum("uw,vw->uv", means, _averages(columns), precision="highest")
 
 
 def _averages(edges: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ def test_slopes_are_fixations_per_item_of_episodes_answered_right():
     fixations[~right] = 30
     found = summarise(table(set_size=sizes, targets=np.where(absent, 0, 1), fixations=fixations, right=right))
     assert found["slope_present"] == pytest.approx(0.5) and found["slope_absent"] == pytest.approx(1.0)
+    assert found["fixations_present_8"] == 6.0 and found["fixations_absent_8"] == 11.0
     assert found["accuracy_8"] == 0.75 and found["fixations_16"] == (10 + 19 + 10 + 30) / 4
     assert "slope_absent" not in summarise(table(set_size=sizes))
     assert "accuracy_8" not in summarise(table(set_size=np.full(3, 8)))

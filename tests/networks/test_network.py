@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from foajax.config import compose
+from foajax.config.parse import ConfigError
 from foajax.config.schema import NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.networks.network import initial_core_state
@@ -90,6 +91,33 @@ def test_the_core_is_told_the_last_actions_and_reward_but_not_of_another_episode
     assert whole.side(point, actions, jnp.zeros(3), jnp.zeros(3, bool)).shape == (3, 4 + 1)
     paper, *_ = build("experiment=constant70", "network=a3c")
     assert paper.side(point, actions, jnp.zeros(3), jnp.zeros(3, bool)).shape == (3, 0)
+
+
+def test_a_priority_map_treats_all_cells_alike():
+    """What it adds for a bright cell moves with the cell, and other cells get the same wherever that is."""
+    agent, network, params = build("experiment=search_rings_p", "network.dense=4", "network.lstm=4")
+    params = jax.tree.map(lambda x: x + 0.1, params())
+    params["params"]["dense"]["kernel"] *= 0  # nothing but the map sees the images
+
+    @jax.jit
+    def logits(row, column):
+        images = [jnp.zeros((1, 1, *shape)) for shape in agent.image_shapes]
+        images[-1] = images[-1].at[0, 0, row, column].set(1.0)
+        side, is_first = jnp.zeros((1, 1, 2 + 4 + 64 + 1)), jnp.zeros((1, 1), bool)
+        return network.apply(params, images, side, is_first, initial_core_state(network, 1))[0].vision_logits
+
+    first, second = (np.asarray(logits(*cell)).reshape(8, 8) for cell in ((2, 2), (4, 5)))
+    np.testing.assert_allclose(second, np.roll(first, (2, 3), (0, 1))[:8, :8], atol=1e-6)
+    assert np.abs(first - first[7, 7]).max() > 1e-2
+
+
+@pytest.mark.parametrize(
+    "word", ["gaze=search", "gaze.grid=[4,4]", "sensor.layout=canvas", "sensor=search_logpolar", "sensor=search_window"]
+)
+def test_a_priority_map_needs_a_cell_for_each_place(word):
+    with pytest.raises(ConfigError, match="network.priority_map=true: accepted is false, or gaze.moves=absolute with"):
+        compose.compose(["experiment=search_rings_p", word])
+    compose.compose(["experiment=search_rings_p", word, "network.priority_map=false"])
 
 
 @pytest.mark.parametrize("norm", [True, False])

@@ -1,0 +1,192 @@
+"""What visual search has shown: the figure and the tables of docs/search.md, made from kept runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from scipy import stats
+
+from foajax.config.parse import replace
+from foajax.config.schema import Config, GazeConfig, RingSensor
+from foajax.envs.search import optimal_return
+from foajax.reporting import claims, cost
+from foajax.reporting.curves import RunData, colours_of, save
+from foajax.reporting.markdown import fill, table
+from foajax.reporting.scores import CONFIDENCE, Interval
+from foajax.sensors.registry import make_sensor
+from foajax.viewing.style import STYLE
+
+_BEST = "search_rings_p"
+_LARGE = (1080, 1920)
+SIZES = (1, 4, 8, 16)  # letters in the scenes of all runs that are compared
+_SENSORS = {
+    _BEST: "rings and periphery",
+    "search_rings": "three nested rings",
+    "search_logpolar": "log-polar retina",
+    "search_window": "small window, full resolution",
+    "search_wide": "wide window, 4x4 means",
+    f"{_BEST}_1225": "rings and periphery",
+    "search_window_1225": "small window, full resolution",
+    "search_full": "whole frame, no gaze",
+}
+_GAZES = {
+    _BEST: "learned",
+    f"{_BEST}-no_map": "learned, without the priority map",
+    f"{_BEST}-raster": "scripted: row by row",
+    f"{_BEST}-random": "random",
+    f"{_BEST}-frozen": "frozen",
+}
+_TARGETS = {
+    f"{_BEST}-letter": "a T among Ls",
+    f"{_BEST}-conjunction": "a bright T among bright Ls and dim Ts",
+    f"{_BEST}-feature": "a bright T among dim Ls",
+}
+_SMALL = list(_SENSORS)[:5]  # of about 600 values
+_NOT_RUN = "not run yet"
+
+Groups = Mapping[str, Sequence[RunData]]
+
+
+def over_seeds(values: Sequence[float]) -> Interval:
+    """The mean over runs that differ in their seed, with Student's interval; of one run, the number alone."""
+    mean = float(np.mean(values))
+    if len(values) == 1:
+        return Interval(mean, mean, mean)
+    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
+    return Interval(mean, mean - half, mean + half)
+
+
+def measure(runs: Sequence[RunData], name: str) -> Interval:
+    """A measure of the runs' evaluations (`foajax.envs.measures.summarise`)."""
+    return over_seeds([_measures(run)[name] for run in runs])
+
+
+def earned(runs: Sequence[RunData], size: int) -> Interval:
+    """The return in scenes of so many letters."""
+    return over_seeds(
+        [
+            2 * _measures(run)[f"accuracy_{size}"] - 1 - run.config.search.price * _measures(run)[f"decisions_{size}"]
+            for run in runs
+        ]
+    )
+
+
+def _measures(run: RunData) -> dict[str, float]:
+    return (run.evaluation or {})["measures"]
+
+
+def block(groups: Groups) -> str:
+    """The tables, and what an answer costs."""
+    head = ["values", "seeds", *(f"return at {size}" for size in SIZES), f"accuracy at {SIZES[-1]}", "decisions"]
+    slopes = ["with a target", "without"]
+    parts = (
+        "![Return by set size, and fixations by set size](results/search.png)",
+        table(["sensor, gaze learned", *head], [_row(groups, *item) for item in _SENSORS.items()]),
+        table(["gaze, rings and periphery", *head], [_row(groups, *item) for item in _GAZES.items()]),
+        table(["fixations per letter", *slopes, "accuracy"], [_slopes(groups, *item) for item in _TARGETS.items()]),
+        *([_costs(groups[_BEST])] if _BEST in groups else []),
+        *([_eight(groups[f"{_BEST}-eight"])] if f"{_BEST}-eight" in groups else []),
+        f"Brackets: {100 * CONFIDENCE:.0f} % interval over seeds (Student's t), of 2,000 scenes a seed.",
+    )
+    return "\n" + "\n\n".join(parts) + "\n\n"
+
+
+def _row(groups: Groups, name: str, label: str) -> list[str]:
+    if name not in groups:
+        return [label, *[""] * (len(SIZES) + 3), _NOT_RUN]
+    runs = groups[name]
+    config = runs[0].config
+    return [
+        label,
+        f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
+        str(len(runs)),
+        *(claims.told(earned(runs, size)) for size in SIZES),
+        claims.told(measure(runs, f"accuracy_{SIZES[-1]}")),
+        claims.told(measure(runs, "decisions")),
+    ]
+
+
+def _slopes(groups: Groups, name: str, label: str) -> list[str]:
+    if name not in groups:
+        return [label, "", "", _NOT_RUN]
+    names = ("slope_present", "slope_absent", "accuracy")
+    return [label, *(claims.told(measure(groups[name], key)) for key in names)]
+
+
+def _eight(runs: Sequence[RunData]) -> str:
+    config = runs[0].config
+    earned = claims.told(over_seeds([run.final_score for run in runs]))
+    return (
+        f"Trained for {config.train.env_steps:,} decisions on scenes of eight letters alone, rings and periphery earn "
+        f"{earned} there ({len(runs)} seeds). Full sight earns {optimal_return(config.search)}."
+    )
+
+
+def _costs(runs: Sequence[RunData]) -> str:
+    config = runs[0].config
+    decisions = measure(runs, "decisions").value
+    rows = []
+    for shape in (config.env.frame_shape, _LARGE):
+        at = replace(config, env=replace(config.env, frame_shape=shape))
+        looked, whole = (cost.count(each)["decision_flops"] for each in (at, _whole(at)))
+        answer = looked * decisions
+        rows.append(
+            [f"{shape[0]}x{shape[1]}", *(f"{n / 1e6:,.2f}" for n in (looked, answer, whole)), f"{whole / answer:,.0f}"]
+        )
+    head = ["frame", "MFLOP a decision", "MFLOP an answer", "MFLOP of the whole frame, once", "ratio"]
+    return table(head, rows)
+
+
+def _whole(config: Config) -> Config:
+    """The same network on the whole frame, without a gaze."""
+    sensor = RingSensor(rings=((*config.env.frame_shape, 1),), layout="packed")
+    network = replace(config.network, priority_map=False)
+    return replace(config, sensor=sensor, gaze=GazeConfig(mode="none"), network=network)
+
+
+def draw(groups: Groups) -> Figure:
+    """Left: the return by set size of sensors of about 600 values. Right: fixations by set size."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 4.2), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        colours = colours_of(_SMALL)
+        for name in _SMALL:
+            if name in groups:
+                found = [earned(groups[name], size) for size in SIZES]
+                _line(left, found, color=colours[name], label=_SENSORS[name])
+        for (name, label), colour in zip(_TARGETS.items(), colours.values(), strict=False):
+            for part, style in (("present", "-"), ("absent", "--")):
+                if name in groups:
+                    found = [measure(groups[name], f"fixations_{part}_{size}") for size in SIZES]
+                    _line(right, found, color=colour, linestyle=style, label=f"{label}, {part}")
+        for plot, what in ((left, "return"), (right, "fixations until the right answer")):
+            plot.set(xlabel="letters in the scene", ylabel=what, xticks=SIZES)
+            plot.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _line(plot: Any, found: Sequence[Interval], **style: Any) -> None:
+    mean, low, high = np.array(found).T
+    plot.errorbar(SIZES, mean, [mean - low, high - mean], marker="o", markersize=4, capsize=3, **style)
+
+
+def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
+    """The runs of search by name."""
+    groups: dict[str, list[RunData]] = {}
+    for run in runs:
+        if run.config.game == "search":
+            groups.setdefault(run.config.name, []).append(run)
+    return groups
+
+
+def write(runs: Sequence[RunData], docs: Path) -> None:
+    """Makes the figure of docs/search.md and the part of it that runs have shown anew; nothing before there are any."""
+    if groups := grouped(runs):
+        save(draw(groups), docs / "results" / "search.png")
+        page = docs / "search.md"
+        page.write_text(fill(page.read_text(), block(groups)))
