@@ -2,7 +2,7 @@
 
 Writes `episode-<seed>.mp4` (a GIF of the first 1,000 steps where the extra `video` is not installed), `heatmap.png` and
 `heatmap.json`, at the speed at which the game is played: 15 decisions a second on Atari with its 60 frames and a frame
-skip of 4.
+skip of 4. Of a scene of visual search also `scanpath-<seed>.png`: its fixations in order, and what was seen at each.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from foajax.runs.agents import load_agent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing import heatmap
 from foajax.viewing.recording import progress_bar, watch
+from foajax.viewing.scanpath import draw_scanpath
 from foajax.viewing.video import why_no_mp4, write_video
 
 
@@ -33,7 +34,7 @@ class Options(Section):
     seed: int = Field(0, description="Seed of the first game; the next one has the next seed.")
     steps: int | None = Field(None, ge=1, description="Cut a game after so many decisions; null for whole games.")
     format: Literal["mp4", "gif"] | None = Field(None, description="Of videos; null for mp4 where that can be written.")
-    video: bool = Field(True, description="Write videos; false for the heat map alone.")
+    video: bool = Field(True, description="Write videos; false for the pictures alone.")
     trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
 
     def check(self) -> None:
@@ -56,6 +57,9 @@ def render(arguments: Sequence[str]) -> None:
             if options.video:
                 written.append(directory / f"episode-{recording.seed}.{suffix}")
                 write_video(recording, written[-1], bar)
+            if recording.is_scene:
+                written.append(directory / f"scanpath-{recording.seed}.png")
+                draw_scanpath(recording).save(written[-1])
             recordings.append(recording._replace(images=()))  # what the heat map does not need may go
     config = stored.agent.config
     heatmap.save(heatmap.heat_map(recordings), directory, f"{config.name} on {config.game}")
