@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
-from PIL import ImageColor
+from PIL import Image, ImageColor
 
+from foajax import cli, demo, render
 from foajax.config.compose import compose
 from foajax.learning.agent import Agent
+from foajax.runs.agents import save_agent
 from foajax.viewing import scanpath
 from foajax.viewing.recording import record
 from foajax.viewing.style import NATURAL, VISION
@@ -16,12 +20,17 @@ pytestmark = pytest.mark.slow  # compiles many scenes
 
 
 @pytest.fixture(scope="module")
-def searched(untrained):
-    """An episode of some fixations, by an agent that has learned nothing."""
+def searcher(untrained):
+    """An agent that has learned nothing."""
     words = ["experiment=search_rings", "network.lstm=16", "network.dense=16", "gaze=random"]
     words += ["gaze.step=[20,40,80]", "gaze.actions=9", "gaze.bounds=fovea"]
-    stored = untrained(Agent(compose(words), num_actions=5, crop_top=None))
-    return next(r for r in record(stored, episodes=50) if len(r.score) >= 5)
+    return untrained(Agent(compose(words), num_actions=5, crop_top=None))
+
+
+@pytest.fixture(scope="module")
+def searched(searcher):
+    """An episode of some fixations."""
+    return next(r for r in record(searcher, episodes=50) if len(r.score) >= 5)
 
 
 def test_decisions_at_one_place_are_one_fixation():
@@ -58,3 +67,15 @@ def test_one_look_and_games_of_other_kinds_have_a_picture_too(searched, recordin
     once = searched._replace(**{name: getattr(searched, name)[:2] for name in ("score", "is_first", "focal_point")})
     assert scanpath.draw_scanpath(once).width == 3 * 16 + 640 + 158
     assert scanpath.draw_scanpath(recording).height > 400
+
+
+def test_demo_and_render_draw_it(searcher, tmp_path, capsys):
+    save_agent(searcher, tmp_path / "agent")
+    assert cli.run(demo.demo, [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'demo'}"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"Of 6 scenes it answered \d right", said) and "demo/scanpath.png" in said
+    assert cli.run(render.render, [f"run={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", "video=false"]) == 0
+    assert "scanpath-0.png" in capsys.readouterr().out
+    for file in (tmp_path / "demo" / "scanpath.png", tmp_path / "out" / "scanpath-0.png"):
+        with Image.open(file) as picture:
+            assert picture.width >= 3 * 16 + 640 + 158
