@@ -42,9 +42,9 @@ _GAZES = {
     f"{_BEST}-frozen": "frozen",
 }
 _TARGETS = {
-    f"{_BEST}-letter": "a T among Ls",
-    f"{_BEST}-conjunction": "a bright T among bright Ls and dim Ts",
-    f"{_BEST}-feature": "a bright T among dim Ls",
+    f"{_BEST}-letter": "letter: a T among Ls",
+    f"{_BEST}-conjunction": "conjunction: a bright T among bright Ls and dim Ts",
+    f"{_BEST}-feature": "feature: a bright T among dim Ls",
 }
 _SMALL = list(_SENSORS)[:5]  # of about 600 values
 _NOT_RUN = "not run yet"
@@ -159,14 +159,15 @@ def draw(groups: Groups) -> Figure:
             if name in groups:
                 found = [earned(groups[name], size) for size in SIZES]
                 _line(left, found, color=colours[name], label=_SENSORS[name])
-        for (name, label), colour in zip(_TARGETS.items(), colours.values(), strict=False):
+        for name, colour in zip(_TARGETS, colours.values(), strict=False):
             for part, style in (("present", "-"), ("absent", "--")):
                 if name in groups:
                     found = [measure(groups[name], f"fixations_{part}_{size}") for size in SIZES]
-                    _line(right, found, color=colour, linestyle=style, label=f"{label}, {part}")
+                    _line(right, found, color=colour, linestyle=style, label=f"{name.rpartition('-')[2]}, {part}")
         for plot, what in ((left, "return"), (right, "fixations until the right answer")):
             plot.set(xlabel="letters in the scene", ylabel=what, xticks=SIZES)
-            plot.legend(frameon=False, fontsize=8)
+            if plot.has_data():
+                plot.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=8)
     return figure
 
 

@@ -47,7 +47,7 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     text = page.read_text()
     assert text.startswith("before\n<!-- results") and text.endswith("<!-- /results -->\nafter\n") and "old" not in text
     assert "| rings and periphery | 556 | 3 | 0.795 [0.745, 0.845] |" in text
-    assert "| a T among Ls | 0.5 | 1 | 0.91 [" in text
+    assert "| letter: a T among Ls | 0.5 | 1 | 0.91 [" in text
     tables = (search._SENSORS, search._GAZES, search._TARGETS)
     assert text.count(search._NOT_RUN) == sum(map(len, tables)) - 3
     rows = [line for line in text.splitlines() if line.startswith(("| 160x160", "| 1080x1920"))]
