@@ -232,9 +232,10 @@ def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray) -> np.n
     if image.ndim == 3:
         sums = sums.reshape(len(sums), -1, 3)
         sums = cv2.transform(sums, luma[None]) if cv2 else sum(sums[..., i] * luma[i] for i in range(3))
-    strips = _share(sums[: len(first) - 1], sums[len(first) - 1 :], shared, part, scale)
-    first, shared, part, scale = spans[1]
-    return _share(np.add.reduceat(strips, first[:-1], 1).T, strips.T[first[shared]], shared, part, scale).T
+    strips = _share(sums[: len(first) - 1], sums[len(first) - 1 :], shared, part)
+    first, shared, part, width = spans[1]
+    total = _share(np.add.reduceat(strips, first[:-1], 1).T, strips.T[first[shared]], shared, part).T
+    return total * np.float32(scale * width)
 
 
 def halve(screen: np.ndarray, crop_top: int) -> np.ndarray:
@@ -274,11 +275,12 @@ def _spans(source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return first, shared, (rest[shared] / target).astype(np.float32)[:, None], target / source
 
 
-def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.ndarray, scale: float) -> np.ndarray:
-    """Means of sums over whole pixels, once pixels that two of them share are divided between these."""
-    sums[shared] -= part * pixels
-    sums[shared - 1] += part * pixels
-    return sums * np.float32(scale)
+def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """The sums, once pixels that two of them share are divided between these."""
+    moved = part * pixels
+    sums[shared] -= moved
+    sums[shared - 1] += moved
+    return sums
 
 
 def _block_sums(x: np.ndarray, factor: int) -> np.ndarray:
