@@ -36,6 +36,6 @@ def test_learned_gaze_earns_more_than_frozen_and_random(tmp_path, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_learned_gaze_finds_what_frozen_and_random_ones_do_not(tmp_path, seed):
-    """By a fifth of the scenes at least: half are right by chance, and a random gaze comes by the target in a quarter."""
+    """By a fifth of the scenes: half are right by chance, and a random gaze comes by the target in a quarter."""
     accuracy = {mode: train(tmp_path / mode, SEARCH, mode, seed)["accuracy"] for mode in MODES}
     assert accuracy["learned"] > max(accuracy["frozen"], accuracy["random"]) + 0.2, accuracy
