@@ -195,6 +195,9 @@ class EnvConfig(Section):
     num_envs: int = Field(32, ge=1, le=100_000, description="Environments, of all processes together.")
     num_groups: int = Field(1, ge=1, description="Sets of environments that step in turn, while another decides.")
     frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
+    crop: bool = Field(
+        True, description="Halve 160 of an Atari screen's 210 rows; else shrink the whole screen to env.frame_shape."
+    )
     crop_top: Mapping[str, Row] = Field({"default": 34, "beam_rider": 20}, description="First screen row, by game.")
     frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per step.")
     noop_max: int = Field(30, ge=0, le=200, description="No-ops before an episode are drawn from 0 to this.")

@@ -65,7 +65,7 @@ class TrainedAgent:
         """Decides on the next frames; the first call after `reset`, or none, begins the episodes.
 
         Args:
-          frames: uint8 [B, H, W], gray: an Atari screen [B, 210, 160], else of `env.frame_shape`.
+          frames: uint8 [B, H, W], gray: Atari screens [B, 210, 160] where `env.crop`, else of `env.frame_shape`.
           rewards: float [B], what the last actions earned, as in training (clipped); None for 0.
           starts: bool [B], whose episodes begin with this frame; None for nobody's.
 

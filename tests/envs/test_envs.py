@@ -91,6 +91,18 @@ def test_the_last_frame_shows_the_end_and_the_first_a_new_game(breakout):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_without_the_crop_the_whole_screen_shrinks_by_area_means(engine):
+    """As in gymnasium's AtariPreprocessing, to the gray level."""
+    actions = random_actions(60, 2, 4)
+    whole = make(config(engine=engine, crop=False, frame_shape=(84, 100)), num_envs=2, seed=0)
+    assert whole.crop_top is None
+    shrunk, screens = play(whole, actions), play(make(config(engine=engine), num_envs=2, seed=0), actions)
+    expected = [[cv2.resize(screen, (100, 84), interpolation=cv2.INTER_AREA) for screen in t] for t in screens.frame]
+    np.testing.assert_array_equal(shrunk.frame, expected)
+    np.testing.assert_array_equal(shrunk.reward, screens.reward)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_fire_on_reset_serves_after_every_lost_life(engine):
     """Who does nothing loses a life each 24 or 25 steps, and never where nobody serves."""
     run = play(make(config(engine=engine, noop_max=0), num_envs=1, seed=0), noops(130))
@@ -221,6 +233,12 @@ def test_games_go_by_any_of_their_names():
         ("brekout", {"engine": "ale"}, r"game=brekout: .*; near: breakout"),
         ("probe:mach", {}, r"game=probe:mach: .*probe:match, .*; near: probe:match"),
         ("pong", {"frame_shape": (84, 84)}, r"env.frame_shape=\[84, 84\]: accepted is \[80, 80\] for game=pong"),
+        ("pong", {"frame_shape": (84, 84)}, r".* or a size up to \[210, 160\] with env.crop=false"),
+        (
+            "pong",
+            {"frame_shape": (84, 161), "crop": False},
+            r"env.frame_shape=\[84, 161\]: accepted is a size up to the",
+        ),
         ("pong", {"crop_top": {"default": 34, "pnog": 20}}, r"env.crop_top.pnog=20: accepted is default or an Atari"),
         ("gymnasium:Nowhere-v0", {}, r"game=gymnasium:Nowhere-v0: .*Nowhere.*accepted is the id of an environment"),
         (
