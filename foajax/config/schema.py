@@ -199,6 +199,9 @@ class EnvConfig(Section):
         True, description="Halve 160 of an Atari screen's 210 rows; else shrink the whole screen to env.frame_shape."
     )
     crop_top: Mapping[str, Row] = Field({"default": 34, "beam_rider": 20}, description="First screen row, by game.")
+    full_action_space: bool = Field(
+        False, description="All 18 actions of an Atari game, not just those that do anything."
+    )
     frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per step.")
     noop_max: int = Field(30, ge=0, le=200, description="No-ops before an episode are drawn from 0 to this.")
     clip_rewards: bool = Field(True, description="Clip rewards to [-1, 1] for learning.")

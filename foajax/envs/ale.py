@@ -38,6 +38,7 @@ class AleEnvironment:
             img_width=width,
             stack_num=1,
             frameskip=env.frame_skip,
+            full_action_space=env.full_action_space,
             noop_max=env.noop_max + 1,
             # Its own episodic_life would begin a new game at a lost life; this one only flags it.
             life_loss_info=env.episodic_life,

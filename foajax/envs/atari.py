@@ -3,7 +3,8 @@
 The Atari engines play the same games, not the same way. Where an episode begins, EnvPool makes its 0 to
 `env.noop_max` no-ops and then one more action, FIRE where the game has it (a no-op where not, or where
 `env.fire_on_reset` is off); ale-py makes FIRE first and counts it among the no-ops. After a lost life EnvPool begins
-with no-ops and FIRE again, ale-py with FIRE alone. Neither can be saved: a resumed run starts new games.
+with no-ops and FIRE again, ale-py with FIRE alone. With `env.full_action_space` each game has FIRE. Neither engine can
+be saved: a resumed run starts new games.
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ class EnvPoolEnvironment:
             img_height=height,
             img_width=width,
             frame_skip=env.frame_skip,
+            full_action_space=env.full_action_space,
             noop_max=env.noop_max + 1,  # EnvPool's no-ops are drawn from [0, noop_max - 1]; 0 crashes it
             episodic_life=env.episodic_life,
             use_fire_reset=env.fire_on_reset,

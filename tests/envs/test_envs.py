@@ -17,7 +17,7 @@ from foajax.config.schema import Config, EnvConfig, RingSensor
 from foajax.envs import probes, tasks
 from foajax.envs.atari import atari_name, envpool_id
 from foajax.envs.gymnasium import area_weights, gray_frames
-from foajax.envs.make import make
+from foajax.envs.make import action_names, make
 
 ENGINES = ["envpool", "ale"]
 NOOP, FIRE, RIGHT, LEFT = range(4)  # Breakout's actions
@@ -100,6 +100,19 @@ def test_without_the_crop_the_whole_screen_shrinks_by_area_means(engine):
     expected = [[cv2.resize(screen, (100, 84), interpolation=cv2.INTER_AREA) for screen in t] for t in screens.frame]
     np.testing.assert_array_equal(shrunk.frame, expected)
     np.testing.assert_array_equal(shrunk.reward, screens.reward)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_all_actions_are_those_of_the_game_by_their_names_and_more(engine):
+    few, every = (config(engine=engine, full_action_space=full) for full in (False, True))
+    environment = make(every, num_envs=2, seed=0)
+    names = action_names(every)
+    assert environment.num_actions == len(names) == len(set(names)) == 18
+    actions = random_actions(60, 2, 4)
+    same = np.array([names.index(name) for name in action_names(few)])[actions]
+    run = play(make(few, num_envs=2, seed=0), actions)
+    np.testing.assert_array_equal(play(environment, same).frame, run.frame)
+    assert (run.frame[1:] != run.frame[:-1]).any()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
