@@ -198,7 +198,8 @@ def save_agent(stored: TrainedAgent, directory: Path, score: Mapping[str, Any] |
     """
     if is_run(directory):
         raise refuse("out", directory, "another directory", why="is a run")
-    config = to_mapping(replace(stored.agent.config, run=None))  # where it was trained does not matter
+    train = replace(stored.agent.config.train, logger=None, logger_kwargs={})
+    config = to_mapping(replace(stored.agent.config, run=None, train=train))  # where it was trained does not matter
     known = {} if score is None else {"score": dict(score)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
