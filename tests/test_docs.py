@@ -35,7 +35,7 @@ def test_a_block_of_code_runs_and_gives_what_it_says(block, monkeypatch):
 
 
 def test_there_are_blocks_and_values():
-    assert len(BLOCKS) == 11
+    assert len(BLOCKS) == 12
     assert sum(len(SAID.findall(str(block.values[0]))) for block in BLOCKS) == 17
 
 

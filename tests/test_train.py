@@ -72,6 +72,33 @@ def test_a_finished_run_goes_on_when_more_is_asked_for(breakout, tmp_path):
     assert steps == sorted(set(steps)) and steps[-1] == 1200
 
 
+LOGGER = """
+class Log:
+    def __init__(self, config, fails_at):
+        self.file, self.fails_at = open(f"{config.run_dir}/log.txt", "w"), fails_at
+
+    def log(self, row, env_steps):
+        if env_steps >= self.fails_at:
+            raise ConnectionError("no network")
+        print(env_steps, row["loss"], file=self.file)
+
+    def close(self):
+        self.file.close()
+"""
+
+
+def test_a_logger_of_ones_own_gets_each_row_and_ends_no_run(breakout, tmp_path):
+    run = shutil.copytree(breakout[0], tmp_path / "run")
+    (tmp_path / "mine.py").write_text(LOGGER)
+    words = ["train.env_steps=1200", "train.logger=mine:Log", "train.logger_kwargs.fails_at=1120"]
+    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", *words, cwd=tmp_path)
+    assert code == 0, err
+    assert out.count("warning: train.logger fails (no network); training goes on") == 1
+    logged = [(row["env_steps"], row["loss"]) for row in rows(run) if 1000 < row["env_steps"] < 1120]
+    assert [tuple(map(float, line.split())) for line in (run / "log.txt").read_text().splitlines()] == logged != []
+    assert rows(run)[-1]["env_steps"] == 1200
+
+
 def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(breakout, tmp_path):
     path = shutil.copytree(breakout[0], tmp_path / "run")
     config = load_config(path)

@@ -36,8 +36,8 @@ def find_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]]) -> Ca
     return found
 
 
-def make_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> Any:
-    """The part itself.
+def bind_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> functools.partial:
+    """What makes the part with these arguments, once it is called.
 
     Raises:
       ConfigError: as `find_part` does, or it takes other arguments than these.
@@ -47,4 +47,9 @@ def make_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **
         inspect.signature(make).bind(**arguments)
     except TypeError as error:
         raise refuse(key, name, f"a call with {inspect.signature(make)} ({error})") from None
-    return make(**arguments)
+    return functools.partial(make, **arguments)
+
+
+def make_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> Any:
+    """The part itself; `ConfigError` as of `bind_part`."""
+    return bind_part(key, name, ours, **arguments)()

@@ -195,7 +195,13 @@ class EnvConfig(Section):
     num_envs: int = Field(32, ge=1, le=100_000, description="Environments, of all processes together.")
     num_groups: int = Field(1, ge=1, description="Sets of environments that step in turn, while another decides.")
     frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
+    crop: bool = Field(
+        True, description="Halve 160 of an Atari screen's 210 rows; else shrink the whole screen to env.frame_shape."
+    )
     crop_top: Mapping[str, Row] = Field({"default": 34, "beam_rider": 20}, description="First screen row, by game.")
+    full_action_space: bool = Field(
+        False, description="All 18 actions of an Atari game, not just those that do anything."
+    )
     frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per step.")
     noop_max: int = Field(30, ge=0, le=200, description="No-ops before an episode are drawn from 0 to this.")
     clip_rewards: bool = Field(True, description="Clip rewards to [-1, 1] for learning.")
@@ -339,11 +345,17 @@ class TrainConfig(Section):
     env_steps: int = Field(5_000_000, ge=1, description="Agent steps, of all environments together, to train for.")
     init_from: str | None = Field(None, description="Run or agent whose parameters a new run begins with.")
     log_every: float = Field(10.0, gt=0, description="Seconds between two rows of metrics.")
+    logger: str | None = Field(None, description="What gets each row too: wandb, or package.module:Class.")
+    logger_kwargs: Mapping[str, Any] = Field({}, description="Arguments of that logger.")
     checkpoint_every: float = Field(60.0, gt=0, description="Seconds between two checkpoints.")
     keep_checkpoints: int = Field(3, ge=1, le=10**9, description="How many of the newest checkpoints are kept.")
     devices: int = Field(1, ge=1, le=10**9, description="Devices of each process, which share its environments.")
     max_skipped: int = Field(20, ge=1, le=10**9, description="Not finite updates in a row that stop the run.")
     dump_skipped: bool = Field(False, description="Keep the batches that such rows begin with, in <run>/skipped.")
+
+    def check(self) -> None:
+        if self.logger is not None and self.logger != "wandb" and ":" not in self.logger:
+            raise refuse("logger", self.logger, ("wandb", CODE))
 
 
 class DistributedConfig(Section):
@@ -445,7 +457,10 @@ class Config(Section):
 
     @property
     def code(self) -> list[str]:
-        """What of it names code outside of foajax, which runs where the part is made."""
+        """What of it names code outside of foajax, which runs where the part is made.
+
+        Not `train.logger`: training alone makes that, from its own words, and nothing that reads a run or an agent.
+        """
         names = {"game": self.game, "sensor.kind": self.sensor.kind}
         names |= {"network.torso": self.network.torso, "network.core": self.network.core}
         ours = ("probe:", "gymnasium:ale_py:")

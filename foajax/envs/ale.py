@@ -6,9 +6,9 @@ import numpy as np
 
 from foajax.config.parse import refuse
 from foajax.config.schema import Config
-from foajax.envs.atari import atari_game
+from foajax.envs.atari import atari_game, screen_shape
 from foajax.envs.base import first_step
-from foajax.types import SCREEN_SHAPE, Outcome, TimeStep
+from foajax.types import Outcome, TimeStep
 
 
 class AleEnvironment:
@@ -27,16 +27,18 @@ class AleEnvironment:
             raise refuse("env.engine", "ale", "envpool where screens are to be rendered in colour")
         env = config.env
         game, self.crop_top = atari_game(config)
+        height, width = screen_shape(config)
         self._env = AtariVectorEnv(
             game,
             num_envs,
             num_threads=env.threads,
             max_num_frames_per_episode=env.max_episode_steps * env.frame_skip,
             repeat_action_probability=env.sticky_actions,
-            img_height=SCREEN_SHAPE[0],
-            img_width=SCREEN_SHAPE[1],
+            img_height=height,
+            img_width=width,
             stack_num=1,
             frameskip=env.frame_skip,
+            full_action_space=env.full_action_space,
             noop_max=env.noop_max + 1,
             # Its own episodic_life would begin a new game at a lost life; this one only flags it.
             life_loss_info=env.episodic_life,

@@ -3,7 +3,8 @@
 The Atari engines play the same games, not the same way. Where an episode begins, EnvPool makes its 0 to
 `env.noop_max` no-ops and then one more action, FIRE where the game has it (a no-op where not, or where
 `env.fire_on_reset` is off); ale-py makes FIRE first and counts it among the no-ops. After a lost life EnvPool begins
-with no-ops and FIRE again, ale-py with FIRE alone. Neither can be saved: a resumed run starts new games.
+with no-ops and FIRE again, ale-py with FIRE alone. With `env.full_action_space` each game has FIRE. Neither engine can
+be saved: a resumed run starts new games.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from foajax.config.parse import refuse
 from foajax.config.schema import Config, game_name
 from foajax.envs.own import OWN
+from foajax.types import SCREEN_SHAPE
 
 FRAME_SHAPE = (80, 80)  # of what `frames.crop_and_halve` makes of it
 
@@ -57,8 +59,8 @@ def check_game(config: Config) -> None:
         atari_game(config)
 
 
-def atari_game(config: Config) -> tuple[str, int]:
-    """The engine's name of the game, and the first screen row kept of it."""
+def atari_game(config: Config) -> tuple[str, int | None]:
+    """The engine's name of the game, and the first screen row kept of it; None where the whole screen is kept."""
     known: Sequence[str]
     if config.env.engine == "envpool":
         from envpool.atari.registration import atari_game_list as known
@@ -70,12 +72,22 @@ def atari_game(config: Config) -> tuple[str, int]:
     return game, _crop_top(config, game, known)
 
 
-def _crop_top(config: Config, game: str, known: Iterable[str]) -> int:
-    env = config.env
-    if env.frame_shape != FRAME_SHAPE:
-        shape = list(env.frame_shape)
-        raise refuse("env.frame_shape", shape, f"{list(FRAME_SHAPE)} for game={config.game}")
+def screen_shape(config: Config) -> tuple[int, int]:
+    """Rows and columns of what an engine is asked for; `env.frame_shape` where it shrinks the screen itself.
+
+    Both engines shrink by area means (OpenCV's INTER_AREA), as Gymnasium's AtariPreprocessing does.
+    """
+    return SCREEN_SHAPE if config.env.crop else config.env.frame_shape
+
+
+def _crop_top(config: Config, game: str, known: Iterable[str]) -> int | None:
+    env, whole = config.env, list(SCREEN_SHAPE)
+    if env.crop and env.frame_shape != FRAME_SHAPE:
+        accepted = f"{list(FRAME_SHAPE)} for game={config.game}, or a size up to {whole} with env.crop=false"
+        raise refuse("env.frame_shape", env.frame_shape, accepted)
+    if env.frame_shape[0] > whole[0] or env.frame_shape[1] > whole[1]:
+        raise refuse("env.frame_shape", env.frame_shape, f"a size up to the screen's, {whole}, where env.crop=false")
     for key, row in env.crop_top.items():
         if key not in known and key != "default":
             raise refuse(f"env.crop_top.{key}", row, "default or an Atari game in snake case")
-    return env.crop_top.get(game, env.crop_top["default"])
+    return env.crop_top.get(game, env.crop_top["default"]) if env.crop else None

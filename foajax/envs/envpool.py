@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from foajax.config.schema import Config
-from foajax.envs.atari import atari_game, envpool_id
+from foajax.envs.atari import atari_game, envpool_id, screen_shape
 from foajax.envs.base import first_step
-from foajax.types import SCREEN_SHAPE, Outcome, TimeStep
+from foajax.types import Outcome, TimeStep
 
 
 class EnvPoolEnvironment:
@@ -23,6 +23,7 @@ class EnvPoolEnvironment:
 
         env = config.env
         game, self.crop_top = atari_game(config)
+        height, width = screen_shape(config)
         self._pool = envpool.make(
             envpool_id(game),
             env_type="gymnasium",
@@ -32,9 +33,10 @@ class EnvPoolEnvironment:
             render_mode="rgb_array" if render else None,
             stack_num=1,
             gray_scale=True,
-            img_height=SCREEN_SHAPE[0],
-            img_width=SCREEN_SHAPE[1],
+            img_height=height,
+            img_width=width,
             frame_skip=env.frame_skip,
+            full_action_space=env.full_action_space,
             noop_max=env.noop_max + 1,  # EnvPool's no-ops are drawn from [0, noop_max - 1]; 0 crashes it
             episodic_life=env.episodic_life,
             use_fire_reset=env.fire_on_reset,

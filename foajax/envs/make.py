@@ -65,7 +65,9 @@ def action_names(config: Config) -> tuple[str, ...] | None:
     ALEInterface.setLoggerMode(LoggerMode.Error)
     emulator = ALEInterface()
     emulator.loadROM(cast(Path, roms.get_rom_path(name)))
-    return tuple(action.name.lower() for action in emulator.getMinimalActionSet())
+    everything = config.env.full_action_space
+    actions = emulator.getLegalActionSet() if everything else emulator.getMinimalActionSet()
+    return tuple(action.name.lower() for action in actions)
 
 
 def steps_per_second(config: Config) -> float:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from foajax.config.parse import flatten, refuse, to_mapping
+from foajax.config.parse import refuse
 from foajax.reporting.curves import PAPER_NAMES, RunData
 from foajax.reporting.scores import Interval, interval, iqm, normalised
-from foajax.runs.directory import FREE
+from foajax.runs.directory import FREE, compared
 
 # Figs. 7 to 9 of the paper: experiments in the order of their legends.
 PRESETS = {
@@ -56,7 +56,7 @@ def _label(name: str, preset: str | None) -> str:
 
 def differing_keys(runs: Sequence[RunData]) -> dict[str, list[Any]]:
     """The keys that matter to what is learned and do not have the same value in all runs."""
-    flat = [dict(flatten(to_mapping(run.config))) for run in runs]
+    flat = [compared(run.config) for run in runs]
     keys = dict.fromkeys(key for each in flat for key in each)
     values = {key: [each.get(key) for each in flat] for key in keys if key not in _NOT_COMPARED}
     return {key: row for key, row in values.items() if any(value != row[0] for value in row)}

@@ -40,8 +40,8 @@ class Agent:
       folder: what `foajax export` wrote.
       greedy: take the likeliest actions; else draw them, as in training.
       seed: of what is drawn.
-      source: 'screen' for Atari screens, uint8 [210, 160]; 'camera' for uint8 [h, w] or [h, w, 3] of any size; by
-        default what the agent was trained with.
+      source: 'screen' for Atari screens to crop, uint8 [210, 160]; 'camera' for uint8 [h, w] or [h, w, 3] of any size;
+        by default what the agent was trained with.
       order: of a colour image's channels, 'rgb' or 'bgr' (OpenCV's).
     """
 
@@ -52,7 +52,7 @@ class Agent:
         self.facts = read_facts(self.folder)
         self.greedy, self.source = greedy, source or self.facts["source"]
         if self.source not in ("screen", "camera") or (self.source == "screen" and self.facts["crop_top"] is None):
-            raise AgentError(f"source={self.source}: accepted is camera, or screen where the agent plays Atari")
+            raise AgentError(f"source={self.source}: accepted is camera, or screen where the agent crops Atari's")
         self.order = order
         self._random = np.random.default_rng(seed)
         self._limits = np.array(self.facts["gaze"]["limits"])  # smallest and largest focal point

@@ -65,7 +65,7 @@ class TrainedAgent:
         """Decides on the next frames; the first call after `reset`, or none, begins the episodes.
 
         Args:
-          frames: uint8 [B, H, W], gray: an Atari screen [B, 210, 160], else of `env.frame_shape`.
+          frames: uint8 [B, H, W], gray: Atari screens [B, 210, 160] where `env.crop`, else of `env.frame_shape`.
           rewards: float [B], what the last actions earned, as in training (clipped); None for 0.
           starts: bool [B], whose episodes begin with this frame; None for nobody's.
 
@@ -198,7 +198,8 @@ def save_agent(stored: TrainedAgent, directory: Path, score: Mapping[str, Any] |
     """
     if is_run(directory):
         raise refuse("out", directory, "another directory", why="is a run")
-    config = to_mapping(replace(stored.agent.config, run=None))  # where it was trained does not matter
+    train = replace(stored.agent.config.train, logger=None, logger_kwargs={})
+    config = to_mapping(replace(stored.agent.config, run=None, train=train))  # where it was trained does not matter
     known = {} if score is None else {"score": dict(score)}
     try:
         directory.mkdir(parents=True, exist_ok=True)

@@ -181,6 +181,11 @@ def describe_error(error: Exception) -> str:
     return text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}"
 
 
+def compared(config: Config) -> dict[str, Any]:
+    """A run's dotted keys and their values, but for its logger's, which may always change."""
+    return {key: value for key, value in flatten(to_mapping(config)) if not key.startswith("train.logger")}
+
+
 def _settle_config(path: Path, config: Config) -> None:
     """Writes ``config.yaml`` if it is new or differs in ways that may; RunError if in others."""
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
@@ -197,7 +202,7 @@ def check_same_run(path: Path, config: Config) -> None:
 
     Where nothing was learned yet, because the run was refused, it may differ: the next words correct the last ones.
     """
-    stored, asked = (dict(flatten(to_mapping(c))) for c in (load_config(path), config))
+    stored, asked = compared(load_config(path)), compared(config)
     if not _has_begun(path):
         return
     # With a falling learning rate the length of the run is part of what a step learns.

@@ -1,4 +1,4 @@
-"""What a run says while it trains: ``metrics.jsonl``, TensorBoard, the terminal.
+"""What a run says while it trains: ``metrics.jsonl``, TensorBoard, the terminal, and what `train.logger` names.
 
 ``metrics.jsonl`` in the run directory is the source of truth, one JSON object a row:
 
@@ -15,7 +15,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from numbers import Integral
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -27,10 +27,12 @@ from foajax.config.parse import one_line
 from foajax.runs import durable
 from foajax.runs.display import Display
 from foajax.runs.durable import WholeFile
+from foajax.runs.row_logger import RowLogger
 from foajax.runs.rows import parse_row
 from foajax.runs.tensorboard import EventFile
 
 _WARN_EVERY = 60.0  # seconds between two warnings about the same output
+_OTHER = "train.logger"
 
 
 class Logger:
@@ -42,6 +44,7 @@ class Logger:
       start_env_steps: where this start takes it up. Rows beyond it belong to work that will be done again
         and are removed, as are torn ones.
       live: whether to draw in place; None does so where stdout is a terminal.
+      other: makes one more logger, which gets each row too.
 
     Raises:
       OSError: ``metrics.jsonl`` cannot be read or written now. Later such errors are only reported.
@@ -54,6 +57,7 @@ class Logger:
         total_env_steps: int,
         start_env_steps: int,
         live: bool | None = None,
+        other: Callable[[], RowLogger] | None = None,
     ) -> None:
         directory = Path(run_dir)
         self._metrics = _MetricsFile(directory / "metrics.jsonl", start_env_steps)
@@ -66,6 +70,10 @@ class Logger:
             start=(start_env_steps, self._metrics.seconds),
             live=live,
         )
+        self._other: RowLogger | None = None
+        if other is not None:
+            with self._survive(_OTHER):
+                self._other = other()
 
     def write(self, row: Mapping[str, SupportsFloat]) -> None:
         """One row of scalars; ``env_steps`` is required, ``time`` is added unless it is there."""
@@ -78,6 +86,10 @@ class Logger:
         with self._survive("tensorboard"):
             self._events.scalars(record)
         self._display.show(record)
+        if self._other is not None:
+            with self._survive(_OTHER):
+                finite = {name: x for name, x in record.items() if x is not None and name != "env_steps"}
+                self._other.log(finite, env_steps)
 
     def image(self, tag: str, array: UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]) -> None:
         """An image, gray or colour, 0..255, for TensorBoard; belongs to the last row's ``env_steps``."""
@@ -93,6 +105,9 @@ class Logger:
         for output, close in (("metrics.jsonl", self._metrics.close), ("tensorboard", self._events.close)):
             with self._survive(output):
                 close()
+        if self._other is not None:
+            with self._survive(_OTHER):
+                self._other.close()
         self._display.close()
 
     def __enter__(self) -> Logger:
@@ -111,7 +126,8 @@ class Logger:
             if now - self._warned.get(output, -math.inf) >= _WARN_EVERY:
                 self._warned[output] = now
                 reason = one_line(error) or type(error).__name__
-                self.message(f"warning: {output} cannot be written ({reason}); training goes on")
+                failed = "fails" if output == _OTHER else "cannot be written"
+                self.message(f"warning: {output} {failed} ({reason}); training goes on")
 
 
 def _plain(value: SupportsFloat) -> int | float | None:

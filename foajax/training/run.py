@@ -23,6 +23,7 @@ from foajax.learning.sharding import Layout
 from foajax.runs.agents import begin_from, save_facts
 from foajax.runs.directory import RunDir, note_failure
 from foajax.runs.logger import Logger
+from foajax.runs.row_logger import find_logger
 from foajax.training.collector import ROLLOUTS_TO_OBSERVE, Collector, update_on
 from foajax.training.dump import Dump
 from foajax.training.episodes import EpisodeTracker
@@ -92,7 +93,8 @@ class Run:
             self._journal.write_to(None)
             return None
         save_facts(self._agent, run_dir.path)
-        logger = Logger(run_dir.path, total_env_steps=config.train.env_steps, start_env_steps=env_steps)
+        total, other = config.train.env_steps, find_logger(config)
+        logger = Logger(run_dir.path, total_env_steps=total, start_env_steps=env_steps, other=other)
         self._journal.write_to(resources.enter_context(logger))
         resources.enter_context(self._saving.checkpoints)
         self._journal.say(f"{run_dir.path}: {self._how_it_starts()}")

@@ -14,6 +14,7 @@ from foajax.launch import processes
 from foajax.launch.signals import StopRequest
 from foajax.runs.agents import TrainedAgent, check_source, load_agent
 from foajax.runs.directory import is_run, open_run
+from foajax.runs.row_logger import find_logger
 from foajax.runtime import use_compilation_cache
 from foajax.sensors.registry import make_sensor
 from foajax.training import profiling
@@ -24,7 +25,8 @@ def check(config: Config) -> None:
     """Finds mistakes that a configuration does not show by itself; of a sweep, in all runs before the first one.
 
     Raises:
-      ConfigError: no gaze and a focal area that is not the whole frame; no such game; no agent to begin with.
+      ConfigError: no gaze and a focal area that is not the whole frame; no such game; no such logger; no
+        agent to begin with.
     """
     window, frame = make_sensor(config.sensor).window, config.env.frame_shape
     check_window(config, window)
@@ -32,6 +34,7 @@ def check(config: Config) -> None:
         sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
         raise refuse("gaze.mode", "none", f"a focal area {sizes}; or learned, frozen, random, scripted")
     check_game(config)
+    find_logger(config)
     if config.train.init_from is not None and not is_run(Path(config.run_dir)):  # one that goes on does not need it
         check_source(config.train.init_from)
 

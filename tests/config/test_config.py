@@ -200,6 +200,7 @@ OUT_OF_RANGE = [
     ("train.env_steps", 10**15),
     ("train.dump_skipped", 1),
     ("train.log_every", 0.0),
+    ("train.logger", "tensorboard"),
     ("train.checkpoint_every", -1.0),
     ("train.keep_checkpoints", 0),
     ("train.max_skipped", 0),

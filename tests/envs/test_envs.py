@@ -17,7 +17,7 @@ from foajax.config.schema import Config, EnvConfig, RingSensor
 from foajax.envs import probes, tasks
 from foajax.envs.atari import atari_name, envpool_id
 from foajax.envs.gymnasium import area_weights, gray_frames
-from foajax.envs.make import make
+from foajax.envs.make import action_names, make
 
 ENGINES = ["envpool", "ale"]
 NOOP, FIRE, RIGHT, LEFT = range(4)  # Breakout's actions
@@ -88,6 +88,31 @@ def test_the_last_frame_shows_the_end_and_the_first_a_new_game(breakout):
     new_game = np.roll(breakout.is_over, 1, axis=0)
     new_game[0] = True
     assert bricks[new_game].all() and not bricks[breakout.is_over].all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_without_the_crop_the_whole_screen_shrinks_by_area_means(engine):
+    """As in gymnasium's AtariPreprocessing, to the gray level."""
+    actions = random_actions(60, 2, 4)
+    whole = make(config(engine=engine, crop=False, frame_shape=(84, 100)), num_envs=2, seed=0)
+    assert whole.crop_top is None
+    shrunk, screens = play(whole, actions), play(make(config(engine=engine), num_envs=2, seed=0), actions)
+    expected = [[cv2.resize(screen, (100, 84), interpolation=cv2.INTER_AREA) for screen in t] for t in screens.frame]
+    np.testing.assert_array_equal(shrunk.frame, expected)
+    np.testing.assert_array_equal(shrunk.reward, screens.reward)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_all_actions_are_those_of_the_game_by_their_names_and_more(engine):
+    few, every = (config(engine=engine, full_action_space=full) for full in (False, True))
+    environment = make(every, num_envs=2, seed=0)
+    names = action_names(every)
+    assert environment.num_actions == len(names) == len(set(names)) == 18
+    actions = random_actions(60, 2, 4)
+    same = np.array([names.index(name) for name in action_names(few)])[actions]
+    run = play(make(few, num_envs=2, seed=0), actions)
+    np.testing.assert_array_equal(play(environment, same).frame, run.frame)
+    assert (run.frame[1:] != run.frame[:-1]).any()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -221,6 +246,12 @@ def test_games_go_by_any_of_their_names():
         ("brekout", {"engine": "ale"}, r"game=brekout: .*; near: breakout"),
         ("probe:mach", {}, r"game=probe:mach: .*probe:match, .*; near: probe:match"),
         ("pong", {"frame_shape": (84, 84)}, r"env.frame_shape=\[84, 84\]: accepted is \[80, 80\] for game=pong"),
+        ("pong", {"frame_shape": (84, 84)}, r".* or a size up to \[210, 160\] with env.crop=false"),
+        (
+            "pong",
+            {"frame_shape": (84, 161), "crop": False},
+            r"env.frame_shape=\[84, 161\]: accepted is a size up to the",
+        ),
         ("pong", {"crop_top": {"default": 34, "pnog": 20}}, r"env.crop_top.pnog=20: accepted is default or an Atari"),
         ("gymnasium:Nowhere-v0", {}, r"game=gymnasium:Nowhere-v0: .*Nowhere.*accepted is the id of an environment"),
         (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,6 +101,18 @@ def test_screens_become_frames_bit_for_bit(crop_top):
     screen = np.random.default_rng(0).integers(0, 256, (210, 160), np.uint8)
     wanted = np.asarray(frames.crop_and_halve(jnp.asarray(screen), crop_top))
     assert (robot.halve(screen, crop_top) == wanted).all()
+
+
+def test_an_agent_of_whole_screens_shrinks_them_as_the_engines_do(make_stored, fill):
+    stored = make_stored(
+        "experiment=constant50_sub2_packed", "env.crop=false", "env.frame_shape=[84,84]", crop_top=None
+    )
+    screen = np.random.default_rng(0).integers(0, 256, (210, 160), np.uint8)
+    shrunk = cv2.resize(screen, (84, 84), interpolation=cv2.INTER_AREA)
+    agent = Agent(fill(stored))
+    difference = np.rint(255 * agent.frame(screen)) - shrunk  # exact halves may be rounded the other way
+    assert np.abs(difference).max() <= 1 and np.mean(difference != 0) < 0.01
+    np.testing.assert_array_equal(np.rint(255 * agent.frame(shrunk)), shrunk)
 
 
 @pytest.mark.parametrize("opencv", [True, False], ids=["OpenCV", "NumPy alone"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import sys
 
@@ -12,10 +13,10 @@ import pytest
 import yaml
 
 from foajax import cli, evaluate, player
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, replace, to_mapping
 from foajax.config.shipped import agents
 from foajax.reporting.curves import read_run
-from foajax.runs.agents import begin_from, load_agent
+from foajax.runs.agents import begin_from, load_agent, save_agent
 from foajax.runs.directory import load_config
 from foajax.types import TimeStep, TrainState
 
@@ -58,6 +59,18 @@ def test_loading_runs_no_code_that_only_the_configuration_names(strange, capsys)
     error = capsys.readouterr().err
     assert error.count("\n") == 2 and error.count("trust=true") == 2
     assert not (strange.parent / "ran").exists()
+
+
+def test_an_agents_logger_is_nobodys_business(pong, tmp_path):
+    """It needs no trust, since nothing imports it, and a shipped agent does not have it."""
+    config = pong.agent.config
+    train = replace(config.train, logger="no_such_module:Logger", logger_kwargs={"key": "secret"})
+    logged = dataclasses.replace(pong, agent=dataclasses.replace(pong.agent, config=replace(config, train=train)))
+    save_agent(logged, tmp_path / "agent")
+    assert load_config(tmp_path / "agent").train == config.train
+    file = tmp_path / "agent" / "config.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"train": to_mapping(train)}))
+    assert load_agent(tmp_path / "agent").agent.config.train.logger == "no_such_module:Logger"
 
 
 @pytest.mark.parametrize("strange", ["sensor", "network.torso", "network.core"], indirect=True)

@@ -69,6 +69,19 @@ def test_the_sensor_looks_at_the_screen_that_is_shown(recording):
     assert bright[lit].mean() > 0.99 and bright[~lit].mean() < 0.05
 
 
+def test_the_sensor_looks_at_the_screen_that_is_shown_where_all_of_it_shrinks(untrained):
+    words = ["sensor=constant50_sub2", "sensor.rings=[[40,40,1]]", "network.dense=8", "network.lstm=8"]
+    agent = Agent(compose([*words, "env.crop=false", "env.frame_shape=[105,80]"]), 4, None)
+    game = next(record(untrained(agent), max_steps=40))
+    assert game.frame_origin == (0.0, 2.0, 2.0) and game.mean_frame.shape == (105, 80)
+    assert game.screens[0].shape == (210, 160, 3)
+    for screen, (y, x), area in zip(game.screens, game.focal_point, game.images[0], strict=True):
+        blocks = screen.max(axis=-1).reshape(105, 2, 80, 2).max(axis=(1, 3))
+        lit, bright = blocks[y - 20 : y + 20, x - 20 : x + 20] > 0, area > 0
+        assert np.mean(bright[lit]) > 0.99 and np.mean(bright[~lit]) < 0.05
+    assert len(np.unique(game.focal_point, axis=0)) > 10
+
+
 @pytest.fixture(scope="module")
 def seeker(untrained):
     """An agent for seek that has learned nothing, without a vision head."""
