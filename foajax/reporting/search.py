@@ -123,7 +123,7 @@ def _eight(runs: Sequence[RunData]) -> str:
     earned = claims.told(over_seeds([run.final_score for run in runs]))
     return (
         f"Trained for {config.train.env_steps:,} decisions on scenes of eight letters alone, rings and periphery earn "
-        f"{earned} there ({len(runs)} seeds). Full sight earns {optimal_return(config.search)}."
+        f"{earned} there (seeds: {len(runs)}). Full sight earns {optimal_return(config.search)}."
     )
 
 
