@@ -11,7 +11,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
 
 import jax
-import numpy as np
+import noise
 import processes
 import pytest
 from jaxtyping import install_import_hook
@@ -45,13 +45,11 @@ def no_process_is_left():
 
 @pytest.fixture(scope="session")
 def untrained():
-    """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
+    """Makes an agent with parameters of noise."""
     from foajax.runs.agents import TrainedAgent
 
     def make(agent, env_steps=0):
-        random = np.random.default_rng(0)
-        shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
-        params = jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
+        params = noise.params(agent.initial_params, jax.random.key(0))
         return TrainedAgent(agent, params, agent.initial_statistics(), env_steps)
 
     return make
