@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import signal
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
+# Before anything imports jax, and for the processes that tests start. Compilation is most of what tests cost, and what
+# they compile runs but a few times: LLVM optimises nothing, in one piece.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
 
 import jax
-import numpy as np
+import noise
 import processes
 import pytest
 from jaxtyping import install_import_hook
@@ -20,9 +23,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keeps compiled programs between test runs: most of the time of a first run is compilation."""
+    """Shares compiled programs, small ones too, between test runs, pytest's workers and the processes they start."""
     jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"):
+        os.environ[name.upper()] = str(jax.config.values[name])
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as behind a shell's `&`; what is ignored is inherited
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -40,13 +45,11 @@ def no_process_is_left():
 
 @pytest.fixture(scope="session")
 def untrained():
-    """Makes an agent with parameters of noise: initialisation as in training takes long to compile."""
+    """Makes an agent with parameters of noise."""
     from foajax.runs.agents import TrainedAgent
 
     def make(agent, env_steps=0):
-        random = np.random.default_rng(0)
-        shapes = jax.eval_shape(agent.initial_params, jax.random.key(0))
-        params = jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
+        params = noise.params(agent.initial_params, jax.random.key(0))
         return TrainedAgent(agent, params, agent.initial_statistics(), env_steps)
 
     return make

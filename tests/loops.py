@@ -35,6 +35,7 @@ class Loop:
         self.state = make_state(self.agent, self.config.seed)
         self.collector = Collector(self.agent, self.programs, environments, seed=self.config.seed)
         self.loss = jax.jit(lambda params, rollout: learner.loss(params, self.agent, rollout))
+        self.unroll = jax.jit(self.agent.unroll)
         self.step = 0
         self.metrics = []
 

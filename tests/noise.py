@@ -1,10 +1,18 @@
-"""An environment of noise, for tests of wrappers."""
+"""Noise for tests: parameters that take no time to compile, and an environment for wrappers."""
 
 from __future__ import annotations
 
 import gymnasium
+import jax
 import numpy as np
 from gymnasium import spaces
+
+
+def params(init, *inputs):
+    """Noise in the shapes that `init(*inputs)` gives; initialisation as in training takes long to compile."""
+    random = np.random.default_rng(0)
+    shapes = jax.eval_shape(init, *inputs)
+    return jax.tree.map(lambda shape: random.normal(0, 0.05, shape.shape).astype(np.float32), shapes)
 
 
 class Noise(gymnasium.Env):

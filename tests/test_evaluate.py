@@ -20,10 +20,10 @@ PONG = shipped.agents() / "pong-constant70_packed"
 
 
 @pytest.fixture(scope="module")
-def breakout() -> TrainedAgent:
+def breakout(untrained) -> TrainedAgent:
     """An agent that has not learned anything."""
     agent = Agent(compose(["experiment=constant50_sub2_packed", "network.dense=16", "network.lstm=16"]), 4, 34)
-    return TrainedAgent(agent, agent.initial_params(jax.random.key(0)), agent.initial_statistics(), env_steps=0)
+    return untrained(agent)
 
 
 def test_neighbouring_seeds_share_no_game(breakout):

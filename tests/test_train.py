@@ -15,12 +15,24 @@ from processes import TINY, finish, has_rows, rows, start, wait_for
 
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
+from foajax.launch import launch
 from foajax.launch.processes import Job
 from foajax.runs.agents import load_agent, save_agent
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import load_config, open_run
 from foajax.train import train
 from foajax.training.run import Run
+from foajax.training.start import check
+
+
+@pytest.fixture
+def command(capsys):
+    """Runs the command in this process, which has imported it already: exit code, stdout, stderr."""
+
+    def finish(*words):
+        return launch.run(train, words, check=check), *capsys.readouterr()
+
+    return finish
 
 
 def same(one, other):
@@ -136,11 +148,11 @@ def test_a_shipped_agent_is_the_runs(breakout, tmp_path):
     assert shipped.env_steps == stored.env_steps and shipped.agent.config.sensor == stored.agent.config.sensor
 
 
-def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path):
+def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path, command):
     run, _ = breakout
     words = ["experiment=constant50_sub2_packed", *TINY, f"run={tmp_path}", f"train.init_from={run}"]
     # A step so small that it changes nothing in float32.
-    code, out, err = finish(*words, "train.env_steps=40", "learner.learning_rate=1e-30")
+    code, out, err = command(*words, "train.env_steps=40", "learner.learning_rate=1e-30")
     assert code == 0, err
     assert f"new run of constant50_sub2_packed on breakout, from the parameters of {run}" in out
     chex.assert_trees_all_equal(load_agent(tmp_path).params, load_agent(run).params)
@@ -157,13 +169,14 @@ def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path):
         ),
     ],
 )
-def test_parameters_that_do_not_fit_are_refused_in_one_line(breakout, tmp_path, source, word, said):
+def test_parameters_that_do_not_fit_are_refused_in_one_line(breakout, tmp_path, command, source, word, said):
     words = ["experiment=constant50_sub2_packed", *TINY, f"run={tmp_path / 'new'}", word]
-    code, _, err = finish(*words, f"train.init_from={breakout[0] if source == 'breakout' else source}")
+    code, _, err = command(*words, f"train.init_from={breakout[0] if source == 'breakout' else source}")
     assert code == 2 and len(err.splitlines()) == 1 and err.startswith("foajax: error: train.init_from="), err
     assert said in err
 
 
+@pytest.mark.slow
 def test_another_process_finds_all_compiled_programs(tmp_path):
     """Python hashes strings differently in each process: nothing that is compiled may follow a set's order."""
     cache = tmp_path / "cache"
@@ -228,15 +241,15 @@ def test_two_processes_do_not_share_a_run(tmp_path):
         ("gaze=none", "gaze.mode=none: accepted is a focal area as large as the frame, 80x80, not 16x16; or"),
     ],
 )
-def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, word, said):
-    code, out, err = finish(*TINY, word, f"run={tmp_path / 'run'}")
+def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, command, word, said):
+    code, out, err = command(*TINY, word, f"run={tmp_path / 'run'}")
     assert code == 2 and out == ""
     assert len(err.splitlines()) == 1 and err.startswith("foajax: error: ") and said in err
 
 
-def test_another_meaning_is_refused_by_name(breakout):
+def test_another_meaning_is_refused_by_name(breakout, command):
     run, _ = breakout
-    code, _, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "learner.learning_rate=0.01")
+    code, _, err = command("experiment=constant50_sub2_packed", *TINY, f"run={run}", "learner.learning_rate=0.01")
     assert code == 2 and len(err.splitlines()) == 1 and "learner.learning_rate=0.01: the run in" in err
 
 

@@ -213,11 +213,12 @@ def test_answers_are_fair():
 
 def test_a_cued_episode_shows_the_cue_and_then_the_scene():
     task = search.search(configured("search.target=cued"))
-    state = task.start(jax.random.key(5))
-    first = np.asarray(task.draw(state))
+    draw = jax.jit(task.draw)
+    state = jax.jit(task.start)(jax.random.key(5))
+    first = np.asarray(draw(state))
     assert (first[:70] == scenery.BACKGROUND).all() and (first[73:87, 73:87] > 200).any()
-    after, reward, is_over = task.advance(state, jnp.int32(0), jnp.array([80, 80]))
-    np.testing.assert_array_equal(task.draw(after), state.scene)
+    after, reward, is_over = jax.jit(task.advance)(state, jnp.int32(0), jnp.array([80, 80]))
+    np.testing.assert_array_equal(draw(after), state.scene)
     assert reward == np.float32(-0.01) and not is_over
 
 
@@ -306,7 +307,7 @@ def test_environments_begin_the_same_episodes_together_and_alone():
     """`step_all` gives what `step` gives, at an episode's end too."""
     task = search.search(configured())
     keys = jax.random.split(jax.random.key(2), 6)
-    state, _ = jax.vmap(functools.partial(jax_envs.reset, task))(keys)
+    state, _ = jax.jit(jax.vmap(functools.partial(jax_envs.reset, task)))(keys)
     together = jax.jit(functools.partial(jax_envs.step_all, task))
     alone = jax.jit(jax.vmap(functools.partial(jax_envs.step, task)))
     random = np.random.default_rng(0)
@@ -340,12 +341,12 @@ def test_a_saved_environment_goes_on_bit_for_bit():
 
 
 def test_who_is_told_no_focal_point_looks_at_the_centre():
-    environment = make(configured(), num_envs=3, seed=0)
+    environment = make(configured(), num_envs=32, seed=0)  # as many as `play` has: the same program
     environment.reset()
-    environment.send(np.zeros(3, np.int32))
+    environment.send(np.zeros(32, np.int32))
     environment.recv()
     assert isinstance(environment, jax_envs.JaxEnvironment)
-    np.testing.assert_array_equal(environment.get_state().task.point, np.full((3, 2), 80))
+    np.testing.assert_array_equal(environment.get_state().task.point, np.full((32, 2), 80))
 
 
 def test_the_names_of_the_actions():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +54,7 @@ def test_who_sees_nothing_earns_the_random_return():
 
 
 def test_the_object_is_drawn_where_and_as_the_state_says(episodes):
+    draw = jax.jit(TASK.draw)
     for episode, t in ((0, 0), (1, 37), (2, STEPS)):
         state = seek.SeekState(path=episodes.path[episode], kind=episodes.kind[episode], time=np.int32(t))
         y, x = state.path[t]
@@ -60,7 +63,7 @@ def test_the_object_is_drawn_where_and_as_the_state_says(episodes):
         for i in range(8):
             for j in range(8):
                 expected[y + i, x + j] = 255 * (((i if take else j) % 2) == 0)
-        np.testing.assert_array_equal(TASK.draw(jax.tree.map(jnp.asarray, state)), expected)
+        np.testing.assert_array_equal(draw(state), expected)
 
 
 def test_the_path_bounces_inside_the_frame_on_even_pixels(episodes):
@@ -84,10 +87,9 @@ def test_kinds_are_fair_and_independent_coins(episodes):
 
 @pytest.mark.parametrize("block", [2, 4, 8, 16])
 def test_means_of_blocks_tell_where_and_never_what(episodes, block):
+    draw = jax.jit(functools.partial(seek.draw_object, (80, 80)))
     for corner in episodes.path[:20, 50]:
-        leave, take = (
-            np.asarray(seek.draw_object((80, 80), jnp.asarray(corner), jnp.int32(kind)), float) for kind in (0, 1)
-        )
+        leave, take = (np.asarray(draw(jnp.asarray(corner), jnp.int32(kind)), float) for kind in (0, 1))
         low = [frame.reshape(80 // block, block, 80 // block, block).mean((1, 3)) for frame in (leave, take)]
         np.testing.assert_array_equal(*low)
         y, x = np.nonzero(low[0])
@@ -133,7 +135,8 @@ def test_a_gaze_that_does_not_follow_misses_most(episodes):
 
 def test_other_frame_shapes_have_the_same_rules():
     task = seek.task((32, 49))
-    path = np.asarray(task.start(jax.random.key(1)).path)
+    state = jax.jit(task.start)(jax.random.key(1))
+    path = np.asarray(state.path)
     assert path.min() >= 0 and path[:, 0].max() <= 24 and path[:, 1].max() <= 41
     assert np.all(path % 2 == 0)
-    assert task.draw(task.start(jax.random.key(1))).shape == (32, 49)
+    assert jax.eval_shape(task.draw, state).shape == (32, 49)

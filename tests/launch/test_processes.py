@@ -42,8 +42,7 @@ TWENTY_UPDATES = 640  # env_steps
 
 
 def start(*words, **variables):
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
-    return processes.start(*WORDS, *words, env=environment | variables)
+    return processes.start(*WORDS, *words, env=os.environ | variables)
 
 
 def start_job(count, *words, last=None, others=()):

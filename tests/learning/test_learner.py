@@ -65,7 +65,7 @@ def test_values_learn_from_lambda_returns(seek):
         return metrics["natural_value_loss"], metrics["vision_value_loss"]
 
     np.testing.assert_allclose(value_losses("lambda", 1.0), value_losses("n_step", 1.0), rtol=1e-5)
-    steps, value = rollout.steps, seek.agent.unroll(seek.state.params, rollout).natural_value
+    steps, value = rollout.steps, seek.unroll(seek.state.params, rollout).natural_value
     error = steps.reward[1:] + seek.config.learner.natural.gamma * ~steps.is_terminal[1:] * value[1:] - value[:-1]
     expected = 0.5 * np.mean(np.square(error), where=~np.asarray(steps.is_first[1:]))
     np.testing.assert_allclose(value_losses("lambda", 0.0)[0], expected, rtol=1e-5)
@@ -178,7 +178,7 @@ def test_information_is_what_decisions_tell_of_what_was_seen(seek):
 
     def information(scale):
         state = jax.tree.map(jnp.copy, seek.state)
-        seen = seek.agent.unroll(state.params, learner.minibatch(rollout, jnp.int32(0), 4))
+        seen = seek.unroll(state.params, learner.minibatch(rollout, jnp.int32(0), 4))
         for head, logits in (("natural", seen.natural_logits), ("vision", seen.vision_logits)):
             weights = state.params["params"][f"{head}_policy"]
             # About their mean, so that which action is the likeliest does depend on what is seen.
@@ -212,7 +212,7 @@ def test_unrolling_a_rollout_gives_what_acting_saw(seek):
     while not rollout.steps.is_first[1:].any():
         (rollout,), _ = seek.collect()
     assert np.any(rollout.core_state.hidden != 0)
-    output = seek.agent.unroll(seek.state.params, rollout)
+    output = seek.unroll(seek.state.params, rollout)
     for head in ("natural", "vision"):
         actual = losses.log_prob(getattr(output, f"{head}_logits"), getattr(rollout.steps, f"{head}_action"))
         np.testing.assert_allclose(actual, getattr(rollout.steps, f"{head}_log_prob"), atol=1e-5)

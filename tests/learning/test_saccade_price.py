@@ -29,10 +29,10 @@ def play(agent, params, rewards, firsts):
 
 
 @pytest.mark.parametrize("cost_per", ["pixel", "saccade"])
-def test_a_saccade_is_paid_with_the_reward_of_the_decision_that_it_serves(cost_per):
+def test_a_saccade_is_paid_with_the_reward_of_the_decision_that_it_serves(cost_per, untrained):
     agent = Agent(compose([*WORDS, "gaze.cost=0.01", f"gaze.cost_per={cost_per}"]), num_actions=2, crop_top=None)
     rewards, firsts = np.linspace(-1, 1, 12), np.arange(12) % 7 == 0  # an episode of 7 steps, then another
-    points, recorded = play(agent, agent.initial_params(jax.random.key(0)), rewards, firsts)
+    points, recorded = play(agent, untrained(agent).params, rewards, firsts)
     assert len(np.unique(points, axis=0)) > 3
     wanted = rewards.copy()
     for t in range(12):
@@ -52,11 +52,11 @@ def test_the_vision_head_is_credited_with_the_price_right_after_its_move():
     np.testing.assert_allclose(stream.r_t[:-1], -prices[:-1], atol=1e-7)
 
 
-def test_a_gaze_that_stays_or_is_free_pays_nothing():
+def test_a_gaze_that_stays_or_is_free_pays_nothing(untrained):
     for words in (["gaze=frozen", "gaze.cost=0.5"], ["gaze.cost=0"]):
         agent = Agent(compose([*WORDS, *words]), num_actions=2, crop_top=None)
         rewards = np.linspace(-1, 1, 5).astype(np.float32)
-        _, recorded = play(agent, agent.initial_params(jax.random.key(0)), rewards, np.arange(5) == 0)
+        _, recorded = play(agent, untrained(agent).params, rewards, np.arange(5) == 0)
         np.testing.assert_array_equal(recorded, rewards)
     free = replace(agent.config.gaze, cost=0.0)
     assert free == agent.config.gaze and agent.initial_state(2).owed is None

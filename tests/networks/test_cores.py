@@ -1,5 +1,7 @@
 """Every core: one carry for whole and split unrolls, no leak between episodes, its gradient against a plain loop's."""
 
+import functools
+
 import chex
 import flax.linen as nn
 import jax
@@ -23,6 +25,7 @@ def core(request):
     return made(request.param)
 
 
+@functools.cache
 def made(name, **kwargs):
     """The core, its parameters, inputs, episodes' starts, and a carry of noise."""
     core = make_core(NetworkConfig(core=name, lstm=L, core_kwargs=kwargs))
@@ -32,7 +35,7 @@ def made(name, **kwargs):
     is_first[0, 0] = is_first[3, 1] = is_first[4, 1] = True  # environment 2 never starts anew
     noise = lambda x: jnp.asarray(random.normal(size=x.shape), jnp.float32)  # noqa: E731
     state = jax.tree.map(noise, core.initial_state(B))
-    params = jax.tree.map(noise, core.init(jax.random.key(0), inputs, jnp.asarray(is_first), state))
+    params = jax.tree.map(noise, jax.eval_shape(core.init, jax.random.key(0), inputs, jnp.asarray(is_first), state))
     return jax.jit(core.apply), params, inputs, jnp.asarray(is_first), state
 
 
@@ -48,7 +51,8 @@ def test_a_split_unroll_is_the_whole(core):
 
 def test_episodes_and_environments_do_not_leak(core):
     run, params, inputs, is_first, state = core
-    reached = np.any(jax.grad(lambda x: run(params, x, is_first, state)[0][5, 1].sum())(inputs) != 0, axis=-1)
+    gradient = jax.jit(jax.grad(lambda x: run(params, x, is_first, state)[0][5, 1].sum()))
+    reached = np.any(gradient(inputs) != 0, axis=-1)
     remembers = bool(jax.tree.leaves(state))
     np.testing.assert_array_equal(reached[:, 1], [False, False, False, False, remembers, True, False])
     assert not reached[:, [0, 2]].any()
@@ -64,7 +68,7 @@ def test_an_episodes_start_forgets_what_is_not_finite(core):
 @pytest.mark.parametrize("name", REMEMBER)
 def test_a_carry_is_remembered_while_the_episode_lasts(name):
     run, params, inputs, is_first, state = made(name)
-    reached = jax.grad(lambda s: (run(params, inputs, is_first, s)[0][-1] ** 2).sum())(state)
+    reached = jax.jit(jax.grad(lambda s: (run(params, inputs, is_first, s)[0][-1] ** 2).sum()))(state)
     for part in jax.tree.leaves(reached):
         assert np.any(part[2] != 0) and not np.any(part[:2])
 
@@ -103,21 +107,23 @@ def test_values_and_gradients_are_those_of_a_plain_loop(name, loop):
 
     def results(function):
         total = lambda p, x, s: jnp.sum(jnp.sin(function(p, x, is_first, s)[0]))  # noqa: E731
-        return function(params, inputs, is_first, state)[0], jax.grad(total, (0, 1, 2))(params, inputs, state)
+        outputs = jax.jit(function)(params, inputs, is_first, state)[0]
+        return outputs, jax.jit(jax.grad(total, (0, 1, 2)))(params, inputs, state)
 
     chex.assert_trees_all_close(results(run), results(plain), rtol=1e-4, atol=1e-5)
 
 
 def test_gradients_are_those_of_finite_differences(core):
     run, params, inputs, is_first, state = core
-    total = lambda p, x, s: jnp.sum(jnp.sin(run(p, x, is_first, s)[0]))  # noqa: E731
+    total = jax.jit(lambda p, x, s: jnp.sum(jnp.sin(run(p, x, is_first, s)[0])))
     jax.test_util.check_grads(total, (params, inputs, state), order=1, modes=["rev"], eps=1e-2, rtol=0.05, atol=0.05)
 
 
 @pytest.mark.parametrize("name", REMEMBER)
 def test_the_gate_that_keeps_begins_open(name):
     core = make_core(NetworkConfig(core=name, lstm=L, forget_bias=2.0))
-    params = core.init(jax.random.key(0), jnp.zeros((1, 1, F)), jnp.zeros((1, 1), bool), core.initial_state(1))
+    inputs = jnp.zeros((1, 1, F)), jnp.zeros((1, 1), bool), core.initial_state(1)
+    params = jax.jit(core.init)(jax.random.key(0), *inputs)
     norm = params["params"].get("norm", params["params"].get("lstm_norm"))
     assert sorted(np.unique(norm["bias"])) == [0.0, 2.0]
 
@@ -154,7 +160,7 @@ def test_a_network_of_ones_own_parts():
     words = ["network.dense=0", "network.last_actions=false", f"network.torso={HERE}:Mean", f"network.core={HERE}:Sum"]
     words += ["network.core_kwargs.width=4", "network.core_kwargs.scale=2"]  # the mean, focal point and last reward
     agent = Agent(compose(["experiment=constant70_packed", *words]), 4, None)
-    params = agent.initial_params(jax.random.key(0))
+    params = jax.jit(agent.initial_params)(jax.random.key(0))
     assert sorted(params["params"]) == ["natural_policy", "natural_value", "vision_policy", "vision_value"]
     assert jax.tree.map(jnp.shape, agent.initial_state(2).core_state) == {"sum": (2, 4)}
 

@@ -55,7 +55,8 @@ def a3c(x, params, borders):
 )
 def test_a_torso_follows_the_definition(config, size, expected):
     image = np.random.default_rng(0).normal(size=(2, size, size, 1)).astype(np.float32)
-    features, params = make_torso(NetworkConfig(**config)).init_with_output(jax.random.key(1), jnp.asarray(image))
+    init = jax.jit(make_torso(NetworkConfig(**config)).init_with_output)
+    features, params = init(jax.random.key(1), jnp.asarray(image))
     wanted = expected(image.astype(np.float64), params["params"]).reshape(2, -1)
     np.testing.assert_allclose(features, wanted, atol=2e-5)
     assert np.ptp(wanted) > 0.1

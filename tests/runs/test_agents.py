@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import shutil
 import sys
 
@@ -106,11 +107,12 @@ def screens(seed, batch=2):
 @pytest.mark.parametrize("greedy", [True, False])
 def test_it_decides_as_the_pure_agent_does(pong, greedy):
     pong.reset(2, seed=5, greedy=greedy)
+    act = jax.jit(functools.partial(pong.agent.act, greedy=greedy))
     state, rewards = pong.agent.initial_state(2), np.array([0.0, 1.0], np.float32)
     for t, is_first in enumerate(([True, True], [False, False], [False, True])):
         timestep = TimeStep(screens(t), rewards, np.array(is_first), np.zeros(2, bool))
         key = jax.random.fold_in(jax.random.key(5), t)
-        output, _, state = pong.agent.act(pong.params, pong.statistics, state, timestep, key, greedy=greedy)
+        output, _, state = act(pong.params, pong.statistics, state, timestep, key)
         actions = pong.decide(screens(t), rewards, starts=np.array(is_first) if t else None)
         expected = (output.natural_action, output.vision_action, output.focal_point)
         chex.assert_trees_all_equal(tuple(actions), jax.tree.map(np.asarray, expected))

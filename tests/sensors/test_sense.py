@@ -246,9 +246,7 @@ def test_odd_sizes_match_the_oracle(scene):
     parts, frame_shape, points = scene
     sensor = RingSensor(**parts)
     frames = random_frames((len(points), *frame_shape))
-    # Each example is a program of its own: not worth the compiler's while.
-    run = jax.jit(batched(sensor), compiler_options={"xla_backend_optimization_level": "0"})
-    images = run(jnp.asarray(frames), jnp.array(points))
+    images = batched(sensor)(jnp.asarray(frames), jnp.array(points))
     assert tuple(image.shape[1:3] for image in images) == make_sensor(sensor).image_shapes(frame_shape)
     for index, (frame, point) in enumerate(zip(frames, points, strict=True)):
         for image, wanted in zip(images, expected(frame, point, sensor), strict=True):
