@@ -127,7 +127,7 @@ SHIPPED = sorted(file.parent for file in demo.agents().glob("*/config.yaml"))
 def test_a_shipped_agent_can_be_read_and_has_its_score(path):
     stored = agents.load_agent(path)
     assert stored.agent.config.game in path.name and stored.env_steps > 1e6
-    assert agents.load_score(path)["episodes"] == 30
+    assert agents.load_score(path)["episodes"] >= 30
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((stored.params, stored.statistics)))
 
 

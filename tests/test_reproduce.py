@@ -50,6 +50,7 @@ def test_commands_of_what_is_left(capsys):
     assert configs[-1].sensor.layout == "canvas"
 
 
+@pytest.mark.slow
 def test_a_stage_is_trained_evaluated_and_then_left_alone(short, capsys):
     assert cli.run(reproduce.reproduce, ["jobs=2"]) == 0
     for seed in (0, 1):

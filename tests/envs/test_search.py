@@ -23,7 +23,9 @@ VARIANTS = ["letter", "feature", "conjunction", "cued"]
 
 
 def configured(*words: str, game: str = "search") -> Config:
-    return compose(["experiment=search_rings", "search.staircase=false", f"game={game}", *words])
+    return compose(
+        ["experiment=search_rings", "search.staircase=false", "search.set_sizes=[8]", f"game={game}", *words]
+    )
 
 
 @functools.cache

@@ -109,6 +109,7 @@ def test_four_devices_and_then_two_learn_what_one_learns(one, tmp_path):
     assert_same(tmp_path, one)
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_learns(one, two):
     assert_same(two, one)
 

@@ -240,7 +240,7 @@ PROBE = [*VIEW, "learner.learning_rate=2e-3", "learner.natural.gamma=0.5", "trai
     "probe, value",
     [
         ("delay", 0.75),  # the mean of gamma, a step before the reward, and 1
-        ("match", 1.0),  # of the action that suits what is seen
+        pytest.param("match", 1.0, marks=pytest.mark.slow),  # of the action that suits what is seen
     ],
 )
 def test_the_value_of_a_probe_is_learned(probe, value):
@@ -250,6 +250,7 @@ def test_the_value_of_a_probe_is_learned(probe, value):
     np.testing.assert_allclose(learned, value, atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_core_learns_to_remember():
     loop = Loop("game=probe:memory", *PROBE, "learner.natural.gamma=0.9")
     assert loop.run(400) > 0.8 / 5  # the best is a reward in four steps and a reset; 0 without memory
