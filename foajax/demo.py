@@ -6,7 +6,6 @@ plays some scenes, of which the longest successful search is shown.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 import webbrowser
@@ -19,12 +18,12 @@ from foajax import cli
 from foajax.config.parse import ConfigError, Section, refuse, replace
 from foajax.config.schema import Config
 from foajax.config.shipped import agents
-from foajax.runs.agents import TrainedAgent, load_agent, load_score
+from foajax.runs.agents import load_agent, load_score
 from foajax.runs.directory import load_config
 from foajax.runtime import use_compilation_cache
 from foajax.sensors.registry import make_sensor
 from foajax.viewing.player_page import write_page
-from foajax.viewing.recording import Recording, progress_bar, watch
+from foajax.viewing.recording import progress_bar, watch
 from foajax.viewing.scanpath import draw_scanpath
 
 _FIRST = ("breakout", "pong")  # what is played where no game is asked for
@@ -77,43 +76,31 @@ def demo(arguments: Sequence[str]) -> None:
     if options.game not in (None, stored.agent.config.game):
         raise refuse("game", options.game, f"null or {stored.agent.config.game}", why=f"agent={path} plays another")
     use_compilation_cache()
-    if _searches(stored):
-        stored = _with_most_letters(stored)
-    print(_introduction(path.name, stored.agent.config))
-    games = _SCENES if _searches(stored) else 1
+    config = stored.agent.config
+    if config.searches:  # scenes with as many letters as it was trained on
+        config = replace(config, search=replace(config.search, set_sizes=(max(config.search.set_sizes),)))
+        stored = stored.with_config(config)
+    print(_introduction(path.name, config))
+    games = _SCENES if config.searches else 1
     with progress_bar() as bar:
         played = list(watch(stored, bar, episodes=games, seed=options.seed, greedy=False, max_steps=options.steps))
-    recording = max(played, key=_worth_watching)
+    right = [each for each in played if each.facts is not None and each.facts.get("right")]
+    recording = max(right or played, key=lambda each: len(each.score))
     page = write_page(recording, directory).resolve().as_uri()
-    if recording.is_scene:
+    if config.searches:
         draw_scanpath(recording).save(directory / "scanpath.png")
     ended = "The game was over" if recording.is_over else "The demo stopped"
     score = load_score(path)
     usual = f" Its mean over {score['episodes']} games: {score['mean']:.1f}." if score else ""
     print(f"{ended} after {len(recording.score):,} decisions. Score: {recording.score[-1]:g}.{usual}")
     print(f"Watch it: {page}\n{_LOOK_AT}")
-    if recording.is_scene:
-        right = sum(each.facts is not None and bool(each.facts["right"]) for each in played)
-        print(f"Of {games} scenes it answered {right} right; this is the longest of these.")
+    if config.searches:
+        print(
+            f"Of {games} scenes it answered {len(right)} right; this is the longest of {'these' if right else 'all'}."
+        )
         print(f"The search in one picture: {directory / 'scanpath.png'}")
     if _wants(options.open):
         webbrowser.open(page)
-
-
-def _searches(stored: TrainedAgent) -> bool:
-    return stored.agent.config.game in ("search", "detect")
-
-
-def _worth_watching(recording: Recording) -> tuple[bool, int]:
-    """A search that succeeded, and a long one."""
-    return bool(recording.facts and recording.facts.get("right")), len(recording.score)
-
-
-def _with_most_letters(stored: TrainedAgent) -> TrainedAgent:
-    """The agent, for the largest of the scenes that it was trained on."""
-    config = stored.agent.config
-    config = replace(config, search=replace(config.search, set_sizes=(max(config.search.set_sizes),)))
-    return dataclasses.replace(stored, agent=dataclasses.replace(stored.agent, config=config))
 
 
 def _introduction(name: str, config: Config) -> str:

@@ -8,7 +8,6 @@ protocol: `env.sticky_actions=0.25`, `env.episodic_life=false` (the agent has to
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from typing import Literal
@@ -69,7 +68,7 @@ def evaluate(arguments: Sequence[str]) -> None:
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("games", total=options.episodes)
         games = play(
-            dataclasses.replace(stored, agent=dataclasses.replace(stored.agent, config=config)),
+            stored.with_config(config),
             episodes=options.episodes,
             num_envs=options.num_envs,
             seed=options.seed,

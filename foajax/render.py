@@ -57,7 +57,7 @@ def render(arguments: Sequence[str]) -> None:
             if options.video:
                 written.append(directory / f"episode-{recording.seed}.{suffix}")
                 write_video(recording, written[-1], bar)
-            if recording.is_scene:
+            if recording.config.searches:
                 written.append(directory / f"scanpath-{recording.seed}.png")
                 draw_scanpath(recording).save(written[-1])
             recordings.append(recording._replace(images=()))  # what the heat map does not need may go

@@ -471,6 +471,11 @@ class Config(Section):
         ]
 
     @property
+    def searches(self) -> bool:
+        """Whether its episodes are scenes of visual search."""
+        return self.game in ("search", "detect")
+
+    @property
     def run_dir(self) -> str:
         """Where the run's files are."""
         return self.run or f"runs/{file_name(self.game)}-{self.name}-s{self.seed}"

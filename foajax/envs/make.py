@@ -55,7 +55,7 @@ def action_names(config: Config) -> tuple[str, ...] | None:
     """
     if config.game == "seek":
         return ("leave", "take")
-    if config.game in ("search", "detect"):
+    if config.searches:
         return search.action_names(config)
     if not is_atari(config):
         return None

@@ -65,7 +65,7 @@ def keep(path: Path, name: str | None) -> Path:
 
 def protocol(config: Config) -> tuple[int, bool]:
     """How many episodes a kept score is the mean of, and whether a heat map has to show where the gaze was."""
-    if config.game in ("search", "detect"):  # a scene takes some decisions, and a target may be anywhere in it
+    if config.searches:  # a scene takes some decisions, and a target may be anywhere in it
         return 2000, False
     return 100, config.gaze.mode == "learned"
 

@@ -53,6 +53,10 @@ class TrainedAgent:
     statistics: FrameStatistics
     env_steps: int  # it has been trained for
 
+    def with_config(self, config: Config) -> TrainedAgent:
+        """The same agent where something else than its network differs, such as the game's rules."""
+        return dataclasses.replace(self, agent=dataclasses.replace(self.agent, config=config))
+
     def reset(self, batch: int = 1, *, seed: int = 0, greedy: bool = False) -> None:
         """Begins the episodes of `batch` actors; their policies are sampled, or with `greedy` their modes are taken."""
         self._act = jax.jit(functools.partial(self.agent.act, greedy=greedy))

@@ -78,11 +78,6 @@ class Recording(NamedTuple):
     facts: dict[str, np.ndarray] | None = None  # about the last episode, where the task tells any
 
     @property
-    def is_scene(self) -> bool:
-        """Whether it is a scene of visual search."""
-        return self.facts is not None and "set_size" in self.facts
-
-    @property
     def life_lost(self) -> np.ndarray:
         """Bool [N]: the steps at which the game has a life fewer than before."""
         if self.lives is None:
