@@ -9,7 +9,8 @@ gaze.
 Who cannot read letters yet is best off guessing at once, and who guesses never learns to read. So training may begin
 with scenes full of targets, all turned alike, in half of which one lies in the middle (`search.staircase`): after a
 right answer an environment's next scene has one target fewer, after a wrong one two more. This is a weighted up-down
-staircase (Kaernbach 1991), which settles where two of three answers are right, or at one target.
+staircase (Kaernbach 1991), which settles where two of three answers are right, or at one target. A scene without a
+target says nothing about how many are needed, and leaves the staircase where it is.
 
 Action 0 waits. Each decision costs `search.price`. An answer ends the episode: 1 if it is right, -1 if not; so does
 the `search.max_fixations`-th decision, which counts as a wrong answer where it only waits. Full sight earns
@@ -151,6 +152,7 @@ def _follow(
 ) -> SearchState:
     """The episode after `before`, one step further on the staircase."""
     step = jnp.clip(before.step + jnp.where(before.right, -1, 2), 1, max(search.set_sizes))
+    step = jnp.where(before.targets > 0, step, before.step)
     return _start(search, frame_shape, here, key, step)
 
 

@@ -118,6 +118,18 @@ def test_detect_asks_for_the_whole_target_inside_the_finest_ring():
         np.testing.assert_allclose(facts["overlap"], common / (14**2 + 16**2 - common), atol=1e-5)
 
 
+def test_the_grid_of_detect_reaches_every_target():
+    """From the middle of its cell, the finest ring holds a target wherever it lies in the cell."""
+    config = compose(["experiment=detect_rings_p"])
+    cells = np.array(config.env.frame_shape) // np.array(config.gaze.grid)
+    boxes = scenes(game="detect").boxes[:, 0]
+    middles = boxes[:, :2] // cells * cells + cells // 2
+    ring = np.array(config.sensor.finest)
+    first = middles - ring // 2
+    assert ((boxes[:, :2] >= first) & (boxes[:, :2] + boxes[:, 2:] <= first + ring)).all()
+    assert len(np.unique(boxes[:, :2] % cells, axis=0)) > 40  # of the 49 places in a cell
+
+
 @pytest.mark.slow
 def test_fixations_are_places_and_not_decisions():
     def policy(state, t):
@@ -303,6 +315,18 @@ def test_the_staircase_goes_down_by_one_and_up_by_two():
             environment.recv()
     assert [first for first, _ in levels] == [6, 5, 4, 3, 2, 1, 1, 1, 3, 5]
     assert {second for _, second in levels} == {6}
+
+
+def test_a_scene_without_a_target_leaves_the_staircase_where_it_is():
+    config = configured("search.staircase=true", "search.set_sizes=[6]", "search.absent=true")
+    task = search.search(config)
+    assert task.follow is not None
+    follow = jax.jit(jax.vmap(task.follow))
+    keys = jax.random.split(jax.random.key(0), 40)
+    before = jax.vmap(task.start)(keys)._replace(step=jnp.full(40, 4), right=jnp.arange(40) % 2 == 0)
+    expected = np.where(before.targets == 0, 4, np.where(before.right, 3, 6))
+    np.testing.assert_array_equal(follow(before, keys).step, expected)
+    assert set(expected.tolist()) == {3, 4, 6}
 
 
 def test_environments_begin_the_same_episodes_together_and_alone():
