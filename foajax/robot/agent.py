@@ -27,6 +27,7 @@ except ImportError:
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue in gray (ITU-R BT.601)
 SCREEN = (210, 160)  # an Atari screen's rows and columns
+WHOLE = slice(None), slice(None)  # all rows and columns of a frame
 
 
 class AgentError(Exception):
@@ -82,7 +83,7 @@ class Agent:
         Raises:
           AgentError: the frame is not as the agent takes it. The agent's state is as before then.
         """
-        images = self._sensor.look(self.frame(frame), self.focal_point)
+        images = self._sensor.look(self.frame(frame, self._sensor.reads(self.focal_point)), self.focal_point)
         feed = {f"image_{i}": image[None, None] for i, image in enumerate(images)} | self._side(reward)
         outputs = dict(zip(self._outputs, self._session.run([*self._outputs], feed | self.core), strict=True))
         natural, vision, gaze = self._choose(outputs["natural_logits"]), 0, self.facts["gaze"]
@@ -95,8 +96,8 @@ class Agent:
         self.focal_point = self._move(vision)
         return natural, vision
 
-    def frame(self, image: np.ndarray) -> np.ndarray:
-        """A screen or a camera's image as the frame that the sensor looks at: float32 [H, W] in [0, 1]."""
+    def frame(self, image: np.ndarray, area: tuple = WHOLE) -> np.ndarray:
+        """A screen, or an area of a camera's image, as the frame that is looked at: float32 [H, W] in [0, 1]."""
         shape, kind = getattr(image, "shape", ()), str(getattr(image, "dtype", type(image).__name__))
         is_camera = self.source == "camera"
         fits = len(shape) in (2, 3) and shape[2:] in ((), (3,)) and 0 not in shape if is_camera else shape == SCREEN
@@ -108,7 +109,7 @@ class Agent:
         if shape != tuple(self.facts["frame_shape"]):
             if self.order not in ("rgb", "bgr"):
                 raise AgentError(f"order={self.order}: accepted is rgb or bgr")
-            image = shrink(image, self.facts["frame_shape"], LUMA if self.order == "rgb" else LUMA[::-1])
+            image = shrink(image, self.facts["frame_shape"], LUMA if self.order == "rgb" else LUMA[::-1], area)
         return image.astype(np.float32) * np.float32(1 / 255)
 
     def _side(self, reward: float) -> dict[str, np.ndarray]:
@@ -145,6 +146,14 @@ class Sensor:
         self._sensor, self._shape, self._window = facts["sensor"], facts["frame_shape"], np.array(facts["window"])
         self._by_frame, self._arrays = facts["normalisation"] == "frame", arrays
 
+    def reads(self, focal_point: np.ndarray) -> tuple:
+        """The rows and columns that `look` reads of a frame, as slices."""
+        if self._by_frame or self._sensor.get("peripheral"):
+            return WHOLE
+        corner = focal_point - self._window // 2
+        (top, left), (bottom, right) = np.clip([corner, corner + self._window], 0, self._shape)
+        return slice(top, bottom), slice(left, right)
+
     def look(self, frame: np.ndarray, focal_point: np.ndarray) -> list[np.ndarray]:
         """The images at a focal point (y, x). The frame is normalised where it is looked at, and only there."""
         if self._by_frame:
@@ -166,12 +175,9 @@ class Sensor:
 
     def _cut(self, image: np.ndarray, top: int, left: int) -> np.ndarray:
         """The focal area with its top-left pixel at (top, left)."""
-        (height, width), (rows, columns) = self._window, self._shape
-        if 0 <= top <= rows - height and 0 <= left <= columns - width:
-            return image[top : top + height, left : left + width]
         y, x = max(top, 0), max(left, 0)
-        part = image[y : top + height, x : left + width]
-        area = np.zeros((height, width), np.float32)
+        part = image[y : top + self._window[0], x : left + self._window[1]]
+        area = np.zeros(self._window, np.float32)
         area[y - top : y - top + part.shape[0], x - left : x - left + part.shape[1]] = part
         return area
 
@@ -200,42 +206,44 @@ class Sensor:
         return canvas
 
 
-def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray) -> np.ndarray:
-    """A camera's image [h, w] or [h, w, 3] as a gray frame, uint8 [H, W]: area means, rounded half up.
+def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray, area: tuple = WHOLE) -> np.ndarray:
+    """A camera's image [h, w] or [h, w, 3] as a gray frame, uint8 [H, W]: area means, rounded half up; 0 elsewhere.
 
     An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
     each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
     """
-    axes = list(zip(image.shape, frame_shape, strict=False))
-    if image.ndim == 3 and any(size < 2 * wanted for size, wanted in axes):
+    if image.ndim == 3 and any(size < 2 * wanted for size, wanted in zip(image.shape, frame_shape, strict=False)):
         image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
-    if any(size < wanted for size, wanted in axes):
-        rows, columns = (_weights(*axis) for axis in axes)
-        means = rows @ image.astype(np.float32) @ columns.T
-    else:
-        means = _add_up(np.ascontiguousarray(image), [_spans(*axis) for axis in axes], luma)
-    return np.floor(means + np.float32(0.5)).astype(np.uint8)
+    for axis, wanted in enumerate(frame_shape):
+        if image.shape[axis] < wanted:
+            image = image.repeat(-(-wanted // image.shape[axis]), axis)
+    axes = zip(image.shape, frame_shape, area, strict=False)
+    means = _add_up(image, [_spans(size, wanted, *part.indices(wanted)[:2]) for size, wanted, part in axes], luma)
+    frame = np.zeros(tuple(frame_shape), np.uint8)
+    frame[area] = np.floor(means + np.float32(0.5))
+    return frame
 
 
 def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray) -> np.ndarray:
     # The first step reads every byte, and so it adds up before colours are mixed. No matrix products here: their
-    # threads would wait for each other.
-    flat, (first, shared, part, scale) = image.reshape(len(image), -1), spans[0]
-    sums: Any = np.empty((len(first) - 1 + len(shared), flat.shape[1]), np.float32)
-    for i, begin, end in zip(range(len(sums)), first[:-1], first[1:], strict=False):
-        rows = flat[begin:end]
+    # threads would wait for each other. `_share` needs a spare sum at the end.
+    (first, shared, part, height), (left, divided, piece, width) = spans
+    image = image[first[0] : first[-1] + 1, left[0] : left[-1] + 1]
+    first, left, count = first - first[0], left - left[0], len(first) - 1
+    sums: Any = np.empty((count + 1 + len(shared), *image.shape[1:]), np.float32)
+    for i in range(count):
+        rows = image[first[i] : first[i + 1]]
         if cv2:
             cv2.reduce(rows, 0, cv2.REDUCE_SUM, sums[i : i + 1], cv2.CV_32F)
         else:
-            sums[i] = np.add.reduce(rows, 0, np.uint32)
-    sums[len(first) - 1 :] = flat[first[shared]]
+            sums[i] = rows.sum(0, np.uint32)
+    sums[count], sums[count + 1 :] = 0, image[first[shared]]
     if image.ndim == 3:
-        sums = sums.reshape(len(sums), -1, 3)
         sums = cv2.transform(sums, luma[None]) if cv2 else sum(sums[..., i] * luma[i] for i in range(3))
-    strips = _share(sums[: len(first) - 1], sums[len(first) - 1 :], shared, part)
-    first, shared, part, width = spans[1]
-    total = _share(np.add.reduceat(strips, first[:-1], 1).T, strips.T[first[shared]], shared, part).T
-    return total * np.float32(scale * width)
+    strips = _share(sums[: count + 1], sums[count + 1 :], shared, part)[:-1]
+    sums = np.zeros((len(left), count), np.float32)
+    sums[:-1] = np.add.reduceat(strips[:, : left[-1]], left[:-1], 1).T
+    return _share(sums, strips.T[left[divided]], divided, piece)[:-1].T * np.float32(height * width)
 
 
 def halve(screen: np.ndarray, crop_top: int) -> np.ndarray:
@@ -260,23 +268,16 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 
 @functools.cache
-def _weights(source: int, target: int) -> np.ndarray:
-    """[target, source]: the share of each source pixel in each target pixel, along one axis."""
-    edges, pixel = np.arange(target + 1)[:, None] * source / target, np.arange(source)[None]
-    covered = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
-    return (np.maximum(covered, 0) * target / source).astype(np.float32)
-
-
-@functools.cache
-def _spans(source: int, target: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """The pixel in which each target pixel begins; those that begin inside one, and the part of it before them."""
-    first, rest = np.divmod(np.arange(target + 1) * source, target)
+def _spans(source: int, target: int, begin: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """The source pixel in which each target pixel begin .. end begins; those that begin inside one, and the part of it
+    before them."""
+    first, rest = np.divmod(np.arange(begin, end + 1) * source, target)
     shared = np.flatnonzero(rest)
     return first, shared, (rest[shared] / target).astype(np.float32)[:, None], target / source
 
 
 def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """The sums, once pixels that two of them share are divided between these."""
+    """The sums, once pixels that two of them share are divided between these; the last takes what is nobody's."""
     moved = part * pixels
     sums[shared] -= moved
     sums[shared - 1] += moved

@@ -130,6 +130,26 @@ def test_camera_images_become_the_frames_of_training(shape, colours, opencv, mon
     assert difference.max() <= 1
     # Colours that are mixed last differ most where few pixels are added up.
     assert difference.mean() < (0.15 if min(shape) >= 160 and colours else 0.001)
+    # A part of the frame is what it is in the whole frame, and takes nothing from elsewhere.
+    part = slice(3, 37), slice(20, 80)
+    blank = np.zeros_like(found)
+    blank[part] = found[part]
+    assert (robot.shrink(image, (80, 80), robot.LUMA, part) == blank).all()
+
+
+@pytest.mark.parametrize(
+    "experiment", ["constant50_sub2_packed", "constant70_p_packed", "decreasing", "search_logpolar"]
+)
+def test_only_what_is_looked_at_is_made_of_a_cameras_image(experiment, make_stored, fill):
+    agent = Agent(fill(make_stored(f"experiment={experiment}", "gaze.bounds=point")), source="camera")
+    shape = agent.facts["frame_shape"]
+    image = np.random.default_rng(0).integers(0, 256, (2 * shape[0] + 31, 3 * shape[1] + 7, 3), np.uint8)
+    whole = agent.frame(image)
+    for point in ([0, 0], [shape[0] // 2, shape[1] // 2], [shape[0] - 1, 5]):
+        point = np.array(point)
+        seen = agent._sensor.look(agent.frame(image, agent._sensor.reads(point)), point)
+        for part, expected in zip(seen, agent._sensor.look(whole, point), strict=True):
+            np.testing.assert_array_equal(part, expected)
 
 
 def test_colours_may_come_in_either_order(make_stored, fill):
