@@ -47,6 +47,7 @@ _TARGETS = {
     f"{_BEST}-feature": "feature: a bright T among dim Ls",
 }
 _SMALL = list(_SENSORS)[:5]  # of about 600 values
+_DETECTION = "detect_rings_p"
 _NOT_RUN = "not run yet"
 
 Groups = Mapping[str, Sequence[RunData]]
@@ -91,6 +92,7 @@ def block(groups: Groups) -> str:
         table(["fixations per letter", *slopes, "accuracy"], [_slopes(groups, *item) for item in _TARGETS.items()]),
         *([_costs(groups[_BEST])] if _BEST in groups else []),
         *([_eight(groups[f"{_BEST}-eight"])] if f"{_BEST}-eight" in groups else []),
+        *([_detection(groups[_DETECTION])] if _DETECTION in groups else []),
         f"Brackets: {100 * CONFIDENCE:.0f} % interval over seeds (Student's t), of 2,000 scenes a seed.",
     )
     return "\n" + "\n\n".join(parts) + "\n\n"
@@ -124,6 +126,17 @@ def _eight(runs: Sequence[RunData]) -> str:
     return (
         f"Trained for {config.train.env_steps:,} decisions on scenes of eight letters alone, rings and periphery earn "
         f"{earned} there (seeds: {len(runs)}). Full sight earns {optimal_return(config.search)}."
+    )
+
+
+def _detection(runs: Sequence[RunData]) -> str:
+    names = ("accuracy", "hit_rate", "decisions", "distance", "overlap")
+    right, hit, decisions, distance, overlap = (claims.told(measure(runs, name)) for name in names)
+    earned = claims.told(over_seeds([run.final_score for run in runs]))
+    return (
+        f"Detection (seeds: {len(runs)}): the return is {earned}, with {decisions} decisions. Right are {right} of the "
+        f"scenes and {hit} of the answers. The focal point is {distance} pixels from the target then, and the overlap "
+        f"of the finest ring and the target's plate {overlap}."
     )
 
 
@@ -177,10 +190,10 @@ def _line(plot: Any, found: Sequence[Interval], **style: Any) -> None:
 
 
 def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
-    """The runs of search by name."""
+    """The runs of search and detection by name."""
     groups: dict[str, list[RunData]] = {}
     for run in runs:
-        if run.config.game == "search":
+        if run.config.searches:
             groups.setdefault(run.config.name, []).append(run)
     return groups
 

@@ -15,13 +15,14 @@ CONFIG = compose(["experiment=search_rings_p"])
 SIZES = CONFIG.search.set_sizes
 
 
-def run_of(tmp_path, name, accuracy, *, seed=0):
+def run_of(tmp_path, name, accuracy, *, seed=0, experiment="search_rings_p"):
     """A run in which each further letter costs half a fixation, a whole one where there is no target."""
     measures = {"accuracy": accuracy, "decisions": 5.0, "slope_present": 0.5, "slope_absent": 1.0}
     for size in SIZES:
         measures |= {f"accuracy_{size}": accuracy, f"decisions_{size}": 2.0 + size / 2}
         measures |= {f"fixations_present_{size}": 2.0 + size / 2, f"fixations_absent_{size}": 2.0 + size}
-    config = compose(["experiment=search_rings_p", f"name={name}", f"seed={seed}"])
+    measures |= {"hit_rate": 0.99, "distance": 3.0, "overlap": 0.49}
+    config = compose([f"experiment={experiment}", f"name={name}", f"seed={seed}"])
     return RunData(tmp_path, config, *[np.arange(2.0)] * 3, {"mean": 0.5, "measures": measures})
 
 
@@ -43,11 +44,13 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     search.write([], tmp_path)
     assert "old" in page.read_text()
     names = ("search_rings_p", "search_rings_p-letter")
-    search.write([run_of(tmp_path, name, 0.9 + 0.01 * s, seed=s) for name in names for s in range(3)], tmp_path)
+    runs = [run_of(tmp_path, name, 0.9 + 0.01 * s, seed=s) for name in names for s in range(3)]
+    search.write([*runs, run_of(tmp_path, "detect_rings_p", 0.95, experiment="detect_rings_p")], tmp_path)
     text = page.read_text()
     assert text.startswith("before\n<!-- results") and text.endswith("<!-- /results -->\nafter\n") and "old" not in text
     assert "| rings and periphery | 556 | 3 | 0.795 [0.745, 0.845] |" in text
     assert "| letter: a T among Ls | 0.5 | 1 | 0.91 [" in text
+    assert "Detection (seeds: 1): the return is 0.5, with 5 decisions. Right are 0.95 of the scenes and 0.99" in text
     tables = (search._SENSORS, search._GAZES, search._TARGETS)
     assert text.count(search._NOT_RUN) == sum(map(len, tables)) - 3
     rows = [line for line in text.splitlines() if line.startswith(("| 160x160", "| 1080x1920"))]
