@@ -22,7 +22,7 @@ from foajax.sensors.registry import make_sensor
 from foajax.viewing.style import STYLE
 
 _BEST = "search_rings_p"
-_LARGE = (1080, 1920)
+SHAPES = ((160, 160), (1080, 1920))  # of frames whose cost is compared; the first is that of all runs
 SIZES = (1, 4, 8, 16)  # letters in the scenes of all runs that are compared
 _SENSORS = {
     _BEST: "rings and periphery",
@@ -144,18 +144,18 @@ def _costs(runs: Sequence[RunData]) -> str:
     config = runs[0].config
     decisions = measure(runs, "decisions").value
     rows = []
-    for shape in (config.env.frame_shape, _LARGE):
+    for shape in SHAPES:
         at = replace(config, env=replace(config.env, frame_shape=shape))
-        looked, whole = (cost.count(each)["decision_flops"] for each in (at, _whole(at)))
+        looked, once = (cost.count(each)["decision_flops"] for each in (at, whole(at)))
         answer = looked * decisions
         rows.append(
-            [f"{shape[0]}x{shape[1]}", *(f"{n / 1e6:,.2f}" for n in (looked, answer, whole)), f"{whole / answer:,.0f}"]
+            [f"{shape[0]}x{shape[1]}", *(f"{n / 1e6:,.2f}" for n in (looked, answer, once)), f"{once / answer:,.0f}"]
         )
     head = ["frame", "MFLOP a decision", "MFLOP an answer", "MFLOP of the whole frame, once", "ratio"]
     return table(head, rows)
 
 
-def _whole(config: Config) -> Config:
+def whole(config: Config) -> Config:
     """The same network on the whole frame, without a gaze."""
     sensor = RingSensor(rings=((*config.env.frame_shape, 1),), layout="packed")
     network = replace(config.network, priority_map=False)
