@@ -318,14 +318,14 @@ def test_the_staircase_goes_down_by_one_and_up_by_two():
 
 
 def test_a_scene_without_a_target_leaves_the_staircase_where_it_is():
-    config = configured("search.staircase=true", "search.set_sizes=[6]", "search.absent=true")
-    task = search.search(config)
-    assert task.follow is not None
-    follow = jax.jit(jax.vmap(task.follow))
-    keys = jax.random.split(jax.random.key(0), 40)
-    before = jax.vmap(task.start)(keys)._replace(step=jnp.full(40, 4), right=jnp.arange(40) % 2 == 0)
+    words = "search.staircase=true", "search.set_sizes=[6]", "search.absent=true"
+    before = scenes(*words, episodes=40)
+    before = before._replace(step=np.full(40, 4), right=np.arange(40) % 2 == 0)
+    follow = search.search(configured(*words)).follow
+    assert follow is not None
+    after = jax.jit(jax.vmap(follow))(before, jax.random.split(jax.random.key(1), 40))
     expected = np.where(before.targets == 0, 4, np.where(before.right, 3, 6))
-    np.testing.assert_array_equal(follow(before, keys).step, expected)
+    np.testing.assert_array_equal(after.step, expected)
     assert set(expected.tolist()) == {3, 4, 6}
 
 
