@@ -112,8 +112,8 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
 
 _INTRODUCTION = """\
 This page compares the paper's seven sensors on its three games, and adds controls that the paper does not show.
-`foajax reproduce` makes the runs. `foajax keep` keeps them and writes this page, so no figure on it is written by hand.
-[Compare sensors](experiments.md) says what each sensor is."""
+Runs that are missing are marked *not run yet*. `foajax reproduce` makes the runs. `foajax keep` keeps them and writes
+this page, so no figure on it is written by hand. [Compare sensors](experiments.md) says what each sensor is."""
 
 _SENSORS = """\
 ## What the sensors show (Figs. 5 and 6)
@@ -135,7 +135,6 @@ _PROTOCOL = """\
 - **Curves**: each point is the mean of the last 100 games of training, with no other smoothing. 500 points of each
   curve are kept. With several seeds, thin lines are seeds, the thick line is their mean, and the band is the mean's
   95 % interval by bootstrap over seeds.
-- **Core hours**: hours times cores. Other work on the machine lengthens them.
 
 [results/runs](../results/runs/README.md) has commands, commits and machines of all runs."""
 
@@ -202,7 +201,8 @@ _SCORES = """\
 - **score**: mean of 100 games, in brackets its 95 % interval over seeds, or over the games where there is one seed.
 - **of `nonfoa`**: ratio of the scores, each less that of random play.
 - **MFLOP, ms alone, ms of 32**: arithmetic of one decision, and its time on a CPU, alone and as one of 32 at once
-  ([cost.json](../results/bench/cost.json))."""
+  ([cost.json](../results/bench/cost.json)).
+- **core hours**: how long training took, times cores. Other work on the machine lengthens them."""
 
 
 def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
@@ -245,15 +245,25 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str 
     there = [label for label in _GAZES if label in game.runs]
     if there[:3] != list(_GAZES)[:3]:
         return None
-    rows = [[f"{_GAZES[label]} ({cells[0]})", *cells[1:5]] for label in there for cells in [_row(game, label, costs)]]
+    rows = []
+    for label in there:
+        name = game.runs[label][0].config.name  # what one types: with `_packed`
+        rows.append([f"{_GAZES[label]} (`{name}`)", *_row(game, label, costs)[1:5]])
+    whole, learned, frozen = (
+        claims.above_chance(claims.score(game.runs[label]), game.name).value for label in list(_GAZES)[:3]
+    )
     one = any(len(game.runs[label]) == 1 for label in there)
-    over_what = "over seeds, or over the games where there is one seed" if one else "over seeds"
+    over_what = "over seeds; where there is one seed, over its games" if one else "over seeds"
     verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
-    counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in dict.fromkeys(verdicts))
+    found = [verdict for verdict in dict.fromkeys(verdicts) if verdict != claims.NOT_RUN] + [claims.NOT_RUN]
+    counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in found if verdict in verdicts)
     return (
+        f"On Breakout a learned gaze scores {learned / frozen:.1f} times as much as a frozen one, and "
+        f"{learned / whole:.2f} of what the whole frame\nscores. Both gazes see a fifth of its values.\n\n"
         "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
         f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
-        f"Breakout, 100 whole games, 95 % intervals {over_what}.\n"
+        f"Score: mean of 100 whole games. Brackets: 95 % intervals {over_what}.\n"
+        "Ratios are of scores above random play.\n\n"
         f"The paper's {len(verdicts)} claims on Breakout: {'; '.join(counts)}. [All results](docs/results.md).\n"
     )
 

@@ -33,6 +33,7 @@ _SENSORS = {
     f"{_BEST}_1225": "rings and periphery",
     "search_window_1225": "small window, full resolution",
     "search_full": "whole frame, no gaze",
+    f"{_BEST}-long": "rings and periphery, trained longer",
 }
 _GAZES = {
     _BEST: "learned",
@@ -42,9 +43,10 @@ _GAZES = {
     f"{_BEST}-frozen": "frozen",
 }
 _TARGETS = {
-    f"{_BEST}-letter": "letter: a T among Ls",
-    f"{_BEST}-conjunction": "conjunction: a bright T among bright Ls and dim Ts",
-    f"{_BEST}-feature": "feature: a bright T among dim Ls",
+    _BEST: "letter: a T among Ls, in every scene",
+    f"{_BEST}-letter": "the same, in half of the scenes",
+    f"{_BEST}-conjunction": "conjunction: a bright T among bright Ls and dim Ts, in half",
+    f"{_BEST}-feature": "feature: a bright T among dim Ls, in half",
 }
 _SMALL = list(_SENSORS)[:5]  # of about 600 values
 _DETECTION = "detect_rings_p"
@@ -83,30 +85,32 @@ def _measures(run: RunData) -> dict[str, float]:
 
 def block(groups: Groups) -> str:
     """The tables, and what an answer costs."""
-    head = ["values", "seeds", *(f"return at {size}" for size in SIZES), f"accuracy at {SIZES[-1]}", "decisions"]
-    slopes = ["with a target", "without"]
+    returns = (f"return at {size}" for size in SIZES)
+    head = ["values", "trained for", "seeds", *returns, f"accuracy at {SIZES[-1]}", "decisions, all sizes"]
+    slopes = ["trained for", "seeds", "with a target", "without", "accuracy"]
     parts = (
         "![Return by set size, and fixations by set size](results/search.png)",
         table(["sensor, gaze learned", *head], [_row(groups, *item) for item in _SENSORS.items()]),
         table(["gaze, rings and periphery", *head], [_row(groups, *item) for item in _GAZES.items()]),
-        table(["fixations per letter", *slopes, "accuracy"], [_slopes(groups, *item) for item in _TARGETS.items()]),
+        table(["fixations per letter", *slopes], [_slopes(groups, *item) for item in _TARGETS.items()]),
         *([_costs(groups[_BEST])] if _BEST in groups else []),
         *([_eight(groups[f"{_BEST}-eight"])] if f"{_BEST}-eight" in groups else []),
         *([_detection(groups[_DETECTION])] if _DETECTION in groups else []),
-        f"Brackets: {100 * CONFIDENCE:.0f} % interval over seeds (Student's t), of 2,000 scenes a seed.",
+        f"Brackets: {100 * CONFIDENCE:.0f} % interval over seeds (Student's t), of 2,000 scenes a seed. With two or "
+        "three seeds it is rough and may pass the largest possible value. Slopes are of scenes answered right.",
     )
     return "\n" + "\n\n".join(parts) + "\n\n"
 
 
 def _row(groups: Groups, name: str, label: str) -> list[str]:
     if name not in groups:
-        return [label, *[""] * (len(SIZES) + 3), _NOT_RUN]
+        return [label, *[""] * (len(SIZES) + 4), _NOT_RUN]
     runs = groups[name]
     config = runs[0].config
     return [
         label,
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
-        str(len(runs)),
+        *_trained(runs),
         *(claims.told(earned(runs, size)) for size in SIZES),
         claims.told(measure(runs, f"accuracy_{SIZES[-1]}")),
         claims.told(measure(runs, "decisions")),
@@ -115,16 +119,23 @@ def _row(groups: Groups, name: str, label: str) -> list[str]:
 
 def _slopes(groups: Groups, name: str, label: str) -> list[str]:
     if name not in groups:
-        return [label, "", "", _NOT_RUN]
-    names = ("slope_present", "slope_absent", "accuracy")
-    return [label, *(claims.told(measure(groups[name], key)) for key in names)]
+        return [label, "", "", "", "", _NOT_RUN]
+    runs = groups[name]
+    asked = ("slope_present", *(["slope_absent"] if runs[0].config.search.absent else []))
+    slopes = [claims.told(measure(runs, key)) for key in asked]
+    return [label, *_trained(runs), *slopes, *[""] * (2 - len(slopes)), claims.told(measure(runs, "accuracy"))]
+
+
+def _trained(runs: Sequence[RunData]) -> tuple[str, str]:
+    """How long, in millions of decisions, and how many seeds."""
+    return f"{runs[0].config.train.env_steps / 1e6:g} M", str(len(runs))
 
 
 def _eight(runs: Sequence[RunData]) -> str:
     config = runs[0].config
     earned = claims.told(over_seeds([run.final_score for run in runs]))
     return (
-        f"Trained for {config.train.env_steps:,} decisions on scenes of eight letters alone, rings and periphery earn "
+        f"Trained on scenes of eight letters alone, for {config.train.env_steps:,} decisions, rings and periphery earn "
         f"{earned} there (seeds: {len(runs)}). Full sight earns {optimal_return(config.search)}."
     )
 
@@ -134,9 +145,9 @@ def _detection(runs: Sequence[RunData]) -> str:
     right, hit, decisions, distance, overlap = (claims.told(measure(runs, name)) for name in names)
     earned = claims.told(over_seeds([run.final_score for run in runs]))
     return (
-        f"Detection (seeds: {len(runs)}): the return is {earned}, with {decisions} decisions. Right are {right} of the "
-        f"scenes and {hit} of the answers. The focal point is {distance} pixels from the target then, and the overlap "
-        f"of the finest ring and the target's plate {overlap}."
+        f"Detection (seeds: {len(runs)}): the return is {earned}, with {decisions} decisions. The share of right "
+        f"answers is {hit}, that of scenes answered right {right}. At an answer the focal point is {distance} pixels "
+        f"from the target; the finest ring and the target's plate overlap by {overlap}."
     )
 
 
@@ -148,11 +159,13 @@ def _costs(runs: Sequence[RunData]) -> str:
         at = replace(config, env=replace(config.env, frame_shape=shape))
         looked, once = (cost.count(each)["decision_flops"] for each in (at, whole(at)))
         answer = looked * decisions
-        rows.append(
-            [f"{shape[0]}x{shape[1]}", *(f"{n / 1e6:,.2f}" for n in (looked, answer, once)), f"{once / answer:,.0f}"]
-        )
+        rows.append([_size(shape), *(f"{n / 1e6:,.2f}" for n in (looked, answer, once)), f"{once / answer:,.0f}"])
     head = ["frame", "MFLOP a decision", "MFLOP an answer", "MFLOP of the whole frame, once", "ratio"]
-    return table(head, rows)
+    return f"{table(head, rows)}\n\nReckoned: an answer takes {decisions:.3g} decisions, as at {_size(SHAPES[0])}."
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[0]}x{shape[1]}"
 
 
 def whole(config: Config) -> Config:
@@ -172,11 +185,11 @@ def draw(groups: Groups) -> Figure:
             if name in groups:
                 found = [earned(groups[name], size) for size in SIZES]
                 _line(left, found, color=colours[name], label=_SENSORS[name])
-        for name, colour in zip(_TARGETS, colours.values(), strict=False):
-            for part, style in (("present", "-"), ("absent", "--")):
+        for name, colour in zip(list(_TARGETS)[1:], colours.values(), strict=False):
+            for part, said, style in (("present", "a target", "-"), ("absent", "none", "--")):
                 if name in groups:
                     found = [measure(groups[name], f"fixations_{part}_{size}") for size in SIZES]
-                    _line(right, found, color=colour, linestyle=style, label=f"{name.rpartition('-')[2]}, {part}")
+                    _line(right, found, color=colour, linestyle=style, label=f"{name.rpartition('-')[2]}, {said}")
         for plot, what in ((left, "return"), (right, "fixations until the right answer")):
             plot.set(xlabel="letters in the scene", ylabel=what, xticks=SIZES)
             if plot.has_data():

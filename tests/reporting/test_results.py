@@ -201,7 +201,9 @@ def test_the_page_and_the_readme_of_some_runs(checkout):
     assert "| `constant70_p` | 1,241 | 1 | 100" in page and "| 7.5 | 0.35 | 0.15 | 2.4 |" in page  # 1.2 hours, 2 cores
     assert "| `decreasing` |  |  | not run yet |" in page and "## Pong\nNot run yet." in page
     assert "one seed suggests yes" in page and "Python 3.12.1, jax 0.11.2, a processor." in page
-    assert readme.startswith("before\n<!-- results: made by x -->\n![") and "old" not in readme
+    assert readme.startswith("before\n<!-- results: made by x -->\nOn Breakout") and "old" not in readme
+    assert "2.6 times as much as a frozen one, and 0.83 of" in readme  # less 1.7 of random play
+    assert "| gaze frozen (`constant70_p_packed-frozen`) |" in readme
     assert "| whole frame (`nonfoa`) | 6,400 | 1 | 120 [" in readme and readme.count("| gaze ") == 2
     assert "\n<!-- /results -->\nafter\n" in readme
     for link in ("breakout-gaze.png", "breakout-constant.png", "breakout-heat-constant70.png"):

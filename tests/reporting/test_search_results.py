@@ -22,7 +22,8 @@ def run_of(tmp_path, name, accuracy, *, seed=0, experiment="search_rings_p"):
         measures |= {f"accuracy_{size}": accuracy, f"decisions_{size}": 2.0 + size / 2}
         measures |= {f"fixations_present_{size}": 2.0 + size / 2, f"fixations_absent_{size}": 2.0 + size}
     measures |= {"hit_rate": 0.99, "distance": 3.0, "overlap": 0.49}
-    config = compose([f"experiment={experiment}", f"name={name}", f"seed={seed}"])
+    absent = f"search.absent={name.endswith('letter')}"
+    config = compose([f"experiment={experiment}", f"name={name}", f"seed={seed}", absent])
     return RunData(tmp_path, config, *[np.arange(2.0)] * 3, {"mean": 0.5, "measures": measures})
 
 
@@ -48,11 +49,14 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     search.write([*runs, run_of(tmp_path, "detect_rings_p", 0.95, experiment="detect_rings_p")], tmp_path)
     text = page.read_text()
     assert text.startswith("before\n<!-- results") and text.endswith("<!-- /results -->\nafter\n") and "old" not in text
-    assert "| rings and periphery | 556 | 3 | 0.795 [0.745, 0.845] |" in text
-    assert "| letter: a T among Ls | 0.5 | 1 | 0.91 [" in text
-    assert "Detection (seeds: 1): the return is 0.5, with 5 decisions. Right are 0.95 of the scenes and 0.99" in text
+    assert "| rings and periphery | 556 | 1.5 M | 3 | 0.795 [0.745, 0.845] |" in text
+    assert "| letter: a T among Ls, in every scene | 1.5 M | 3 | 0.5 |  | 0.91 [" in text
+    assert "| the same, in half of the scenes | 1.5 M | 3 | 0.5 | 1 | 0.91 [" in text
+    assert (
+        "Detection (seeds: 1): the return is 0.5, with 5 decisions. The share of right answers is 0.99, that of" in text
+    )
     tables = (search._SENSORS, search._GAZES, search._TARGETS)
-    assert text.count(search._NOT_RUN) == sum(map(len, tables)) - 3
+    assert text.count(search._NOT_RUN) == sum(map(len, tables)) - 4
     rows = [line for line in text.splitlines() if line.startswith(("| 160x160", "| 1080x1920"))]
     ratios = [float(row.split("|")[-2].replace(",", "")) for row in rows]
     assert len(ratios) == 2 and 1 < ratios[0] < ratios[1] and ratios[1] > 50
