@@ -186,10 +186,10 @@ def draw(groups: Groups) -> Figure:
                 found = [earned(groups[name], size) for size in SIZES]
                 _line(left, found, color=colours[name], label=_SENSORS[name])
         for name, colour in zip(list(_TARGETS)[1:], colours.values(), strict=False):
-            for part, said, style in (("present", "a target", "-"), ("absent", "none", "--")):
+            for part, said, style in (("present", "with a target", "-"), ("absent", "without", "--")):
                 if name in groups:
                     found = [measure(groups[name], f"fixations_{part}_{size}") for size in SIZES]
-                    _line(right, found, color=colour, linestyle=style, label=f"{name.rpartition('-')[2]}, {said}")
+                    _line(right, found, color=colour, linestyle=style, label=f"{name.rpartition('-')[2]}: {said}")
         for plot, what in ((left, "return"), (right, "fixations until the right answer")):
             plot.set(xlabel="letters in the scene", ylabel=what, xticks=SIZES)
             if plot.has_data():
