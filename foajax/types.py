@@ -20,7 +20,9 @@ Params = Any  # the network's parameters, a pytree of float32 arrays
 class TimeStep(NamedTuple):
     """What an environment shows after a step; the part that goes to the device."""
 
-    frame: UInt8[HostArray, "B ..."]  # screen, gray, 0..255, as the environment draws it
+    frame: UInt8[
+        HostArray, "B ..."
+    ]  # screen, 0..255, as the environment draws it: [B, H, W] or, in colour, [B, H, W, 3]
     reward: Float[HostArray, "B"]  # what is learned from (clipped where asked), result of the last action
     is_first: Bool[HostArray, "B"]  # an episode starts here: the last action was ignored, reward is 0
     is_terminal: Bool[HostArray, "B"]  # the episode ends here and nothing follows: the value is 0

@@ -199,6 +199,7 @@ class EnvConfig(Section):
         True, description="Halve 160 of an Atari screen's 210 rows; else shrink the whole screen to env.frame_shape."
     )
     crop_top: Mapping[str, Row] = Field({"default": 34, "beam_rider": 20}, description="First screen row, by game.")
+    color: bool = Field(False, description="Frames in colour, of Atari and Gymnasium games; else gray.")
     full_action_space: bool = Field(
         False, description="All 18 actions of an Atari game, not just those that do anything."
     )
@@ -217,6 +218,11 @@ class EnvConfig(Section):
     def check(self) -> None:
         if "default" not in self.crop_top:
             raise refuse("crop_top", self.crop_top, "a mapping with the key 'default'")
+
+    @property
+    def pixel_shape(self) -> tuple[int, ...]:
+        """What follows rows and columns in the shape of screens and frames: (3,) in colour, else ()."""
+        return (3,) if self.color else ()
 
 
 class SearchConfig(Section):

@@ -36,6 +36,7 @@ class AleEnvironment:
             repeat_action_probability=env.sticky_actions,
             img_height=height,
             img_width=width,
+            grayscale=not env.color,
             stack_num=1,
             frameskip=env.frame_skip,
             full_action_space=env.full_action_space,
@@ -77,7 +78,7 @@ class AleEnvironment:
         return timestep, Outcome(score=score, is_over=is_over)
 
     def render(self) -> np.ndarray:
-        """Not offered: ale-py's vector environment keeps gray screens only."""
+        """Not offered: ale-py's vector environment keeps the frames' screens only."""
         raise NotImplementedError("env.engine=ale does not render")
 
     def close(self) -> None:

@@ -55,6 +55,8 @@ def check_game(config: Config) -> None:
     """`ConfigError` where there is no such Atari game, or `env` does not suit it; others show once they are made."""
     if config.env.kwargs and not (is_own(config) or config.game.startswith("gymnasium:")):
         raise refuse("env.kwargs", config.env.kwargs, f"{{}} for game={config.game}")
+    if config.env.color and config.game in OWN:
+        raise refuse("env.color", True, f"false for game={config.game}, whose frames are gray")
     if is_atari(config):
         atari_game(config)
 

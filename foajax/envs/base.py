@@ -8,8 +8,9 @@ lost; then the game goes on in the learner's next episode. At the step limit it 
 ends early among the skipped frames shows the frame before once more.)
 
 An environment of one's own is what `game=package.module:factory` calls: `factory(num_envs=, seed=, **env.kwargs)` gives
-an `Environment` of `num_envs` copies, of which copy i draws from `seed + i`. Its screens are gray frames of
-`env.frame_shape`. `foajax.envs.tasks.JaxEnvironment` makes one of a pure JAX `Task`, a `gymnasium:<id>` needs none.
+an `Environment` of `num_envs` copies, of which copy i draws from `seed + i`. Its screens are frames of
+`env.frame_shape`, gray unless `env.color`. `foajax.envs.tasks.JaxEnvironment` makes one of a pure JAX `Task`, a
+`gymnasium:<id>` needs none.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class EnvPoolEnvironment:
             seed=seed,
             render_mode="rgb_array" if render else None,
             stack_num=1,
-            gray_scale=True,
+            gray_scale=not env.color,
             img_height=height,
             img_width=width,
             frame_skip=env.frame_skip,
@@ -53,7 +53,7 @@ class EnvPoolEnvironment:
         screen, info = self._pool.reset()
         self.lives = info["lives"]
         self._ended = self._over = np.zeros(self.num_envs, bool)
-        return first_step(screen[:, 0])
+        return first_step(_screens(screen))
 
     def send(self, action: np.ndarray) -> None:
         """Starts a step in EnvPool's threads."""
@@ -72,7 +72,7 @@ class EnvPoolEnvironment:
         restarted = self._ended & ~self._over & (lives > self.lives)
         is_over = game_over | truncated | restarted
         timestep = TimeStep(
-            frame=screen[:, 0],
+            frame=_screens(screen),
             reward=reward,
             is_first=self._ended,
             is_terminal=terminated | (truncated & (game_over | lost)),
@@ -88,3 +88,8 @@ class EnvPoolEnvironment:
         """Drops the pool, whose threads end with it."""
         self._pool.close()
         del self._pool
+
+
+def _screens(observation: np.ndarray) -> np.ndarray:
+    """EnvPool's [B, 1, H, W] as [B, H, W]; in colour, its [B, 3, H, W] as [B, H, W, 3]."""
+    return observation[:, 0] if observation.shape[1] == 1 else np.moveaxis(observation, 1, -1)

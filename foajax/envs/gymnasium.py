@@ -1,7 +1,7 @@
-"""Gymnasium's pixel environments as gray frames: `gymnasium:<id>`, the id as `gymnasium.make` takes it.
+"""Gymnasium's pixel environments as frames, gray or in colour: `gymnasium:<id>`, the id as `gymnasium.make` takes it.
 
-Of `env` only `frame_shape`, `clip_rewards`, `max_episode_steps` and the constructor's `kwargs` apply; skipped frames,
-no-ops, lives and sticky actions are an emulator's. An id may name the module that registers it, e.g.
+Of `env` only `frame_shape`, `color`, `clip_rewards`, `max_episode_steps` and the constructor's `kwargs` apply; skipped
+frames, no-ops, lives and sticky actions are an emulator's. An id may name the module that registers it, e.g.
 `gymnasium:my_package:MyGame-v0`.
 """
 
@@ -54,14 +54,15 @@ class GymnasiumEnvironment:
             why = f"{missing} is missing (pip install {missing})" if missing else one_line(error)
             raise refuse("game", config.game, accepted, why=why) from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
-        is_pixels = isinstance(observations, spaces.Box) and _is_image(observations)
+        color = config.env.color
+        is_pixels = isinstance(observations, spaces.Box) and _is_image(observations, color)
         if not (is_pixels and isinstance(actions, spaces.Discrete)):
-            images = "uint8 images [h, w], [h, w, 1] or [h, w, 3]"
+            images = "[h, w, 3] where env.color=true" if color else "[h, w], [h, w, 1] or [h, w, 3]"
             spaces_here = f"{brief(observations)} and {brief(actions)}"
-            accepted = f"an environment with discrete actions and {images}, not {spaces_here}"
+            accepted = f"an environment with discrete actions and uint8 images {images}, not {spaces_here}"
             raise refuse("game", config.game, accepted)
         self.num_envs, self.num_actions = num_envs, int(actions.n)
-        self._shape = config.env.frame_shape
+        self._frames = functools.partial(make_frames, frame_shape=config.env.frame_shape, color=color)
         self._first_action, self._seed, self._clip = int(actions.start), seed, config.env.clip_rewards
 
     def reset(self) -> tuple[TimeStep, Outcome]:
@@ -69,7 +70,7 @@ class GymnasiumEnvironment:
         self._image, _ = self._env.reset(seed=self._seed)
         zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
         self._ended = false
-        timestep = TimeStep(gray_frames(self._image, self._shape), zeros, is_first=~false, is_terminal=false)
+        timestep = TimeStep(self._frames(self._image), zeros, is_first=~false, is_terminal=false)
         return timestep, Outcome(score=zeros, is_over=false)
 
     def send(self, action: np.ndarray) -> None:
@@ -81,7 +82,7 @@ class GymnasiumEnvironment:
         self._image, score, terminated, truncated, _ = self._env.step(self._action)
         score = score.astype(np.float32)
         timestep = TimeStep(
-            frame=gray_frames(self._image, self._shape),
+            frame=self._frames(self._image),
             reward=np.sign(score) if self._clip else score,
             is_first=self._ended,
             is_terminal=terminated.copy(),
@@ -116,6 +117,13 @@ def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
     return np.floor(rows @ images.astype(np.float32) @ columns.T + np.float32(0.5)).astype(np.uint8)
 
 
+def make_frames(images: np.ndarray, frame_shape: tuple[int, ...], *, color: bool) -> np.ndarray:
+    """`gray_frames`; or with `color`, of uint8 [B, h, w, 3], frames [B, H, W, 3] whose channels are each resized so."""
+    if not color:
+        return gray_frames(images, frame_shape)
+    return np.stack([gray_frames(images[..., channel], frame_shape) for channel in range(3)], axis=-1)
+
+
 @functools.cache
 def area_weights(source: int, target: int) -> np.ndarray:
     """[target, source] float32: the share of each source pixel in each target pixel, along one axis.
@@ -129,6 +137,6 @@ def area_weights(source: int, target: int) -> np.ndarray:
     return (np.maximum(covered, 0) * target / source).astype(np.float32)
 
 
-def _is_image(space: spaces.Box) -> bool:
-    is_gray_or_colour = len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[-1] in (1, 3))
-    return space.dtype == np.uint8 and is_gray_or_colour
+def _is_image(space: spaces.Box, color: bool) -> bool:
+    pixel_shapes = [(3,)] if color else [(), (1,), (3,)]
+    return space.dtype == np.uint8 and len(space.shape) in (2, 3) and space.shape[2:] in pixel_shapes

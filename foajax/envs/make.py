@@ -12,7 +12,7 @@ from foajax.config.parts import make_part
 from foajax.config.schema import Config
 from foajax.envs import search
 from foajax.envs.ale import AleEnvironment
-from foajax.envs.atari import atari_name, is_atari, is_own
+from foajax.envs.atari import atari_name, check_game, is_atari, is_own
 from foajax.envs.base import Environment
 from foajax.envs.envpool import EnvPoolEnvironment
 from foajax.envs.gymnasium import GymnasiumEnvironment
@@ -33,6 +33,7 @@ def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> E
     Raises:
       ConfigError: if there is no such game, or the engine cannot do what `env` asks.
     """
+    check_game(config)
     if is_own(config):
         arguments = {**config.env.kwargs, "num_envs": num_envs, "seed": seed}
         made = make_part("game", config.game, {}, **arguments)

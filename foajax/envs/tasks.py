@@ -159,7 +159,8 @@ class JaxEnvironment:
 
     def render(self) -> np.ndarray:
         """The screens, uint8 [B, H, W, 3]."""
-        return np.repeat(np.asarray(self._timestep.frame)[..., None], 3, axis=-1)
+        frame = np.asarray(self._timestep.frame)
+        return frame if frame.ndim == 4 else np.repeat(frame[..., None], 3, axis=-1)
 
     def close(self) -> None:
         """Nothing to close."""

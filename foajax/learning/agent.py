@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any, cast
 
 import jax
@@ -55,8 +56,15 @@ class Agent:
 
     @property
     def image_shapes(self) -> tuple[tuple[int, int, int], ...]:
-        """Of what the sensor gives of a frame, (h, w, 1) each."""
-        return tuple((*shape, 1) for shape in self.sensor.image_shapes(self.config.env.frame_shape))
+        """Of what the sensor gives of a frame, (h, w, 1) or, in colour, (h, w, 3) each."""
+        env = self.config.env
+        return tuple((*shape, math.prod(env.pixel_shape)) for shape in self.sensor.image_shapes(env.frame_shape))
+
+    @property
+    def screen_shape(self) -> tuple[int, ...]:
+        """Of what an environment shows: [H, W] or, in colour, [H, W, 3]."""
+        env = self.config.env
+        return (*(env.frame_shape if self.crop_top is None else SCREEN_SHAPE), *env.pixel_shape)
 
     def initial_params(self, key: PRNGKeyArray) -> Params:
         """Parameters before any learning."""
@@ -65,7 +73,8 @@ class Agent:
 
     def initial_statistics(self) -> FrameStatistics:
         """Frame statistics before any frame."""
-        return frames.initial_statistics(self.config.env.frame_shape if self._by_pixel else ())
+        env = self.config.env
+        return frames.initial_statistics((*env.frame_shape, *env.pixel_shape) if self._by_pixel else ())
 
     def initial_state(self, batch: int) -> ActorState:
         """State of `batch` actors before their first episode; `is_first` of the first step completes it."""
@@ -163,19 +172,19 @@ class Agent:
             mean, std = jax.vmap(frames.frame_statistics)(frame)
         return self.sense(self.normalise(frame, statistics), focal_point), mean, std
 
-    def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W"]:
+    def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W *C"]:
         """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
         self.check(screen)
         return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
 
     def check(self, screen: UInt8[HostArray, "B ..."]) -> None:
         """`ValueError` for screens that are not as the agent was trained with."""
-        shape = self.config.env.frame_shape if self.crop_top is None else SCREEN_SHAPE
+        shape = self.screen_shape
         if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
-            accepted = f"uint8 [B, {shape[0]}, {shape[1]}], gray"
+            accepted = f"uint8 [B, {', '.join(map(str, shape))}], {'RGB' if self.config.env.color else 'gray'}"
             raise refuse("frame", f"{screen.dtype} {list(screen.shape)}", accepted)
 
-    def normalise(self, frame: Float[Array, "B H W"], statistics: FrameStatistics) -> Float[Array, "B H W"]:
+    def normalise(self, frame: Float[Array, "B H W *C"], statistics: FrameStatistics) -> Float[Array, "B H W *C"]:
         """Frames with about zero mean and unit deviation, by the configured rule."""
         mode = self.config.network.normalization
         return jax.vmap(lambda f: frames.normalise(f, statistics, mode=mode))(frame)
@@ -211,8 +220,8 @@ class Agent:
             return draw(key), jnp.zeros(batch)
         return jnp.zeros(batch, jnp.int32), jnp.zeros(batch)
 
-    def sense(self, frame: Num[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
-        """The sensor's images of each frame, [B, h, w, 1]."""
+    def sense(self, frame: Num[Array, "B H W *C"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
+        """The sensor's images of each frame, [B, h, w, 1] or, in colour, [B, h, w, 3]."""
         look = functools.partial(sense, sensor=self.sensor, bounds=self.config.gaze.sense_bounds)
         return jax.vmap(look)(frame, focal_point)
 

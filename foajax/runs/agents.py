@@ -69,7 +69,8 @@ class TrainedAgent:
         """Decides on the next frames; the first call after `reset`, or none, begins the episodes.
 
         Args:
-          frames: uint8 [B, H, W], gray: Atari screens [B, 210, 160] where `env.crop`, else of `env.frame_shape`.
+          frames: uint8 [B, H, W], gray: Atari screens [B, 210, 160] where `env.crop`, else of `env.frame_shape`. With
+            `env.color` they are RGB, [B, H, W, 3].
           rewards: float [B], what the last actions earned, as in training (clipped); None for 0.
           starts: bool [B], whose episodes begin with this frame; None for nobody's.
 
@@ -189,7 +190,7 @@ def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
 def _differences(stored: TrainedAgent, config: Config) -> str:
     """What of another configuration may be why an agent's parameters do not fit it."""
     there, here = (dict(flatten(to_mapping(c))) for c in (stored.agent.config, config))
-    groups = ("sensor", "network", "gaze")
+    groups = ("sensor", "network", "gaze", "env.color")
     differ = [key for key in there if key.startswith(groups) and here.get(key) != there[key]]
     return "that one has " + (", ".join(f"{key}={there[key]}" for key in differ) or "other actions")
 

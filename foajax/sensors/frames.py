@@ -1,7 +1,7 @@
 """From a screen to a normalised frame: crop, 2x2 mean, running statistics.
 
-Pure functions on one frame; the caller vmaps. A frame is float32 [H, W] in [0, 1]: a screen's
-0..255 divided by 255.
+Pure functions on one frame; the caller vmaps. A frame is float32 [H, W] or, in colour, [H, W, 3] in [0, 1]: a
+screen's 0..255 divided by 255.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ SMALLEST_STD = 1e-3  # a quarter of a gray level: frames of one gray have a devi
 CROPPED = 160  # rows kept of an Atari screen
 
 
-def to_frame(screen: UInt8[Array, "h w"], crop_top: int | None) -> Float[Array, "H W"]:
+def to_frame(screen: UInt8[Array, "h w *C"], crop_top: int | None) -> Float[Array, "H W *C"]:
     """The frame that a sensor looks at.
 
     Args:
-      screen: gray, 0..255.
+      screen: gray or in colour, 0..255.
       crop_top: first screen row kept of a 210x160 Atari screen (`crop_and_halve`), or None where
         the screen has the frame's size already.
 
     Returns:
-      The frame, in [0, 1]: [80, 80] where cropped, else [h, w].
+      The frame, in [0, 1]: 80x80 where cropped, else h x w.
     """
     if crop_top is None:
         return screen.astype(jnp.float32) * jnp.float32(1 / 255)
     return crop_and_halve(screen, crop_top)
 
 
-def crop_and_halve(screen: UInt8[Array, "210 160"], crop_top: int) -> Float[Array, "80 80"]:
+def crop_and_halve(screen: UInt8[Array, "210 160 *C"], crop_top: int) -> Float[Array, "80 80 *C"]:
     """Mean of each 2x2 block of the screen rows crop_top .. crop_top + 159.
 
     The sum of four pixels is exact: `round(1020 * frame)` gives it back.
 
     Args:
-      screen: gray, 0..255.
+      screen: gray or in colour, 0..255.
       crop_top: first row kept, 0..50.
 
     Returns:
@@ -61,15 +61,15 @@ def crop_and_halve(screen: UInt8[Array, "210 160"], crop_top: int) -> Float[Arra
     return (rows[:, 0::2] + rows[:, 1::2]).astype(jnp.float32) * jnp.float32(1 / 1020)
 
 
-def frame_statistics(frame: Float[Array, "H W"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def frame_statistics(frame: Float[Array, "H W *C"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean and (population) standard deviation of one frame's pixels."""
     mean = jnp.mean(frame)
     return mean, jnp.sqrt(jnp.mean(jnp.square(frame - mean)))
 
 
 def pixel_statistics(
-    frame: Float[Array, "H W"], statistics: FrameStatistics
-) -> tuple[Float[Array, "H W"], Float[Array, ""]]:
+    frame: Float[Array, "H W *C"], statistics: FrameStatistics
+) -> tuple[Float[Array, "H W *C"], Float[Array, ""]]:
     """One frame's part in statistics whose mean is by pixel: itself, and its deviation from the mean so far.
 
     While nothing has been seen, the deviation is that of the frame's pixels from each other.
@@ -115,11 +115,11 @@ def update_statistics(
 
 
 def normalise(
-    frame: Float[Array, "H W"],
+    frame: Float[Array, "H W *C"],
     statistics: FrameStatistics,
     *,
     mode: Literal["running", "pixel", "frame", "none"],
-) -> Float[Array, "H W"]:
+) -> Float[Array, "H W *C"]:
     """(frame - mean) / max(std, SMALLEST_STD).
 
     Args:
@@ -139,7 +139,7 @@ def normalise(
     return (frame - mean) / jnp.maximum(std, SMALLEST_STD)
 
 
-def _corrected(statistics: FrameStatistics, frame: Float[Array, "H W"]) -> tuple[Array, Array]:
+def _corrected(statistics: FrameStatistics, frame: Float[Array, "H W *C"]) -> tuple[Array, Array]:
     """Mean and deviation without the bias of the zeros at the start; the frame's own while nothing has been seen."""
     mean, std = frame_statistics(frame)
     seen = statistics.weight > 0

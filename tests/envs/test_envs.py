@@ -8,8 +8,10 @@ import chex
 import cv2
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from ale_py import Action, ALEInterface, LoggerMode, roms
 from gymnasium import spaces
 
 from foajax.config.parse import ConfigError
@@ -18,6 +20,7 @@ from foajax.envs import probes, tasks
 from foajax.envs.atari import atari_name, envpool_id
 from foajax.envs.gymnasium import area_weights, gray_frames
 from foajax.envs.make import action_names, make
+from foajax.sensors.frames import to_frame
 
 ENGINES = ["envpool", "ale"]
 NOOP, FIRE, RIGHT, LEFT = range(4)  # Breakout's actions
@@ -100,6 +103,38 @@ def test_without_the_crop_the_whole_screen_shrinks_by_area_means(engine):
     expected = [[cv2.resize(screen, (100, 84), interpolation=cv2.INTER_AREA) for screen in t] for t in screens.frame]
     np.testing.assert_array_equal(shrunk.frame, expected)
     np.testing.assert_array_equal(shrunk.reward, screens.reward)
+
+
+def play_rgb(actions: np.ndarray, first_noops: int) -> np.ndarray:
+    """Breakout on a single ale-py emulator: the larger RGB values of the last two frames, [T+1, 210, 160, 3]."""
+    ALEInterface.setLoggerMode(LoggerMode.Error)
+    emulator = ALEInterface()
+    emulator.setFloat("repeat_action_probability", 0.0)
+    emulator.loadROM(roms.get_rom_path("breakout"))
+    for _ in range(first_noops):
+        emulator.act(Action.NOOP)
+    screens, names = [emulator.getScreenRGB()], emulator.getMinimalActionSet()
+    for action in actions:
+        last = [(emulator.act(names[action]), emulator.getScreenRGB())[1] for _ in range(4)]
+        screens.append(np.maximum(*last[2:]))
+    return np.stack(screens)
+
+
+@pytest.mark.parametrize(("engine", "first_noops"), [("envpool", 1), ("ale", 0)])
+def test_in_colour_screens_and_frames_have_the_emulators_colours(engine, first_noops):
+    actions = np.array([FIRE, RIGHT, RIGHT, LEFT, NOOP, LEFT] * 4)
+    words = {"engine": engine, "color": True, "noop_max": 0, "fire_on_reset": False}
+    screens = play_rgb(actions, first_noops)
+    assert len(np.unique(screens.reshape(-1, 3), axis=0)) > 8 and (screens[1:] != screens[:-1]).any((1, 2, 3)).all()
+    environment = make(config(**words), num_envs=1, seed=0)
+    run = play(environment, actions[:, None])
+    np.testing.assert_array_equal(run.frame[:, 0], screens)
+    halved = to_frame(jnp.asarray(run.frame[-1, 0]), environment.crop_top)
+    blocks = screens[-1, 34:194].reshape(80, 2, 80, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(255 * halved, blocks, atol=1e-4)
+    shrunk = play(make(config(**words, crop=False, frame_shape=(84, 100)), num_envs=1, seed=0), actions[:, None])
+    expected = [cv2.resize(screen, (100, 84), interpolation=cv2.INTER_AREA) for screen in screens]
+    np.testing.assert_array_equal(shrunk.frame[:, 0], expected)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -253,6 +288,8 @@ def test_games_go_by_any_of_their_names():
             r"env.frame_shape=\[84, 161\]: accepted is a size up to the",
         ),
         ("pong", {"crop_top": {"default": 34, "pnog": 20}}, r"env.crop_top.pnog=20: accepted is default or an Atari"),
+        ("seek", {"color": True}, "env.color=true: accepted is false for game=seek, whose frames are gray"),
+        ("probe:match", {"color": True}, "env.color=true: accepted is false for game=probe:match, whose frames are"),
         ("gymnasium:Nowhere-v0", {}, r"game=gymnasium:Nowhere-v0: .*Nowhere.*accepted is the id of an environment"),
         (
             "gymnasium:no_such_module:X-v0",
@@ -479,6 +516,21 @@ def test_gymnasium_images_become_gray_frames(pixels, shape):
         got = run.frame[reference.count, 0].astype(int)
         assert np.abs(got - reference_frame(reference.image())).max() <= 1  # exact ties may round either way
         assert np.mean(got != reference_frame(reference.image())) < 0.01
+
+
+def test_gymnasium_images_become_frames_in_colour(pixels):
+    run = play(make(pixels(color=True), num_envs=2, seed=0), np.zeros((3, 2)))
+    assert run.frame.shape == (4, 2, 80, 80, 3) and run.frame.dtype == np.uint8
+    reference = Pixels()
+    for reference.count in range(4):
+        expected = [reference_frame(reference.image()[..., channel]) for channel in range(3)]
+        np.testing.assert_allclose(run.frame[reference.count, 1], np.stack(expected, -1), atol=1)  # ties
+
+
+@pytest.mark.parametrize("shape", [(80, 80), (80, 80, 1)])
+def test_gymnasium_images_that_are_gray_have_no_colours(pixels, shape):
+    with pytest.raises(ConfigError, match=r"accepted is .* uint8 images \[h, w, 3\] where env.color=true, not Box"):
+        make(pixels(shape, color=True), num_envs=1, seed=0)
 
 
 def test_gymnasium_episodes_end_as_the_others_do(pixels):
