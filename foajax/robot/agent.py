@@ -42,7 +42,7 @@ class Agent:
       greedy: take the likeliest actions; else draw them, as in training.
       seed: of what is drawn.
       source: 'screen' for Atari screens to crop, uint8 [210, 160]; 'camera' for uint8 [h, w] or [h, w, 3] of any size;
-        by default what the agent was trained with.
+        by default what the agent was trained with. One that sees colours takes [210, 160, 3] or [h, w, 3].
       order: of a colour image's channels, 'rgb' or 'bgr' (OpenCV's).
     """
 
@@ -51,14 +51,13 @@ class Agent:
     ) -> None:
         self.folder = Path(folder)
         self.facts = read_facts(self.folder)
-        self.greedy, self.source = greedy, source or self.facts["source"]
+        self.greedy, self.source, self.order = greedy, source or self.facts["source"], order
         if self.source not in ("screen", "camera") or (self.source == "screen" and self.facts["crop_top"] is None):
             raise AgentError(f"source={self.source}: accepted is camera, or screen where the agent crops Atari's")
-        self.order = order
         self._random = np.random.default_rng(seed)
         self._limits = np.array(self.facts["gaze"]["limits"])  # smallest and largest focal point
         with np.load(self.folder / "arrays.npz") as arrays:
-            self._sensor = Sensor(self.facts, dict(arrays))
+            self._sensors = [Sensor(self.facts, dict(arrays), channel) for channel in range(len(arrays["mean"]))]
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads, options.log_severity_level = 1, 1, 3
         network = str(self.folder / "policy.onnx")
@@ -83,8 +82,9 @@ class Agent:
         Raises:
           AgentError: the frame is not as the agent takes it. The agent's state is as before then.
         """
-        images = self._sensor.look(self.frame(frame, self._sensor.reads(self.focal_point)), self.focal_point)
-        feed = {f"image_{i}": image[None, None] for i, image in enumerate(images)} | self._side(reward)
+        frame = self.frame(frame, self._sensors[0].reads(self.focal_point))
+        seen = [sensor.look(frame, self.focal_point) for sensor in self._sensors]
+        feed = {f"image_{i}": np.stack(x)[None] for i, x in enumerate(zip(*seen, strict=True))} | self._side(reward)
         outputs = dict(zip(self._outputs, self._session.run([*self._outputs], feed | self.core), strict=True))
         natural, vision, gaze = self._choose(outputs["natural_logits"]), 0, self.facts["gaze"]
         if gaze["mode"] in ("learned", "random"):
@@ -97,20 +97,22 @@ class Agent:
         return natural, vision
 
     def frame(self, image: np.ndarray, area: tuple = WHOLE) -> np.ndarray:
-        """A screen, or an area of a camera's image, as the frame that is looked at: float32 [H, W] in [0, 1]."""
+        """A screen, or an area of a camera's image, as the frame looked at: float32 [H, W] or [H, W, 3] in [0, 1]."""
         shape, kind = getattr(image, "shape", ()), str(getattr(image, "dtype", type(image).__name__))
-        is_camera = self.source == "camera"
-        fits = len(shape) in (2, 3) and shape[2:] in ((), (3,)) and 0 not in shape if is_camera else shape == SCREEN
-        if kind != "uint8" or not fits:
-            accepted = "[h, w] or [h, w, 3]" if is_camera else f"{list(SCREEN)}, gray"
-            raise AgentError(f"frame={kind} {list(shape)}: accepted is uint8 {accepted}")
-        if not is_camera:
-            return halve(image, self.facts["crop_top"])
-        if shape != tuple(self.facts["frame_shape"]):
-            if self.order not in ("rgb", "bgr"):
-                raise AgentError(f"order={self.order}: accepted is rgb or bgr")
-            image = shrink(image, self.facts["frame_shape"], LUMA if self.order == "rgb" else LUMA[::-1], area)
-        return image.astype(np.float32) * np.float32(1 / 255)
+        is_camera, color = self.source == "camera", self.facts["color"]
+        size = ("h", "w") if is_camera else SCREEN
+        pixels = ((3,),) if color else ((), (3,)) if is_camera else ((),)
+        is_image = kind == "uint8" and len(shape) > 1 and 0 not in shape and shape[2:] in pixels
+        if not is_image or (shape[:2] != SCREEN and not is_camera):
+            accepted = " or ".join(f"[{', '.join(map(str, size + pixel))}]" for pixel in pixels)
+            raise AgentError(f"frame={kind} {list(shape)}: accepted is uint8 {accepted}{', gray' * (pixels == ((),))}")
+        if shape[2:] and self.order not in ("rgb", "bgr"):
+            raise AgentError(f"order={self.order}: accepted is rgb or bgr")
+        if is_camera and shape != (*self.facts["frame_shape"], *pixels[0]):
+            luma = None if color else LUMA if self.order == "rgb" else LUMA[::-1]
+            image = shrink(image, self.facts["frame_shape"], luma, area)
+        image = image[..., ::-1] if color and self.order == "bgr" else image
+        return image.astype(np.float32) * np.float32(1 / 255) if is_camera else halve(image, self.facts["crop_top"])
 
     def _side(self, reward: float) -> dict[str, np.ndarray]:
         """What the network is told beside the images."""
@@ -140,11 +142,11 @@ class Agent:
 
 
 class Sensor:
-    """What is seen of a frame around a focal point: float32 images [h, w]. What lies outside or is hidden is 0."""
+    """What one channel shows around a focal point: float32 images [h, w]. What lies outside or is hidden is 0."""
 
-    def __init__(self, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    def __init__(self, facts: dict[str, Any], arrays: dict[str, np.ndarray], channel: int = 0) -> None:
         self._sensor, self._shape, self._window = facts["sensor"], facts["frame_shape"], np.array(facts["window"])
-        self._by_frame, self._arrays = facts["normalisation"] == "frame", arrays
+        self._arrays, self._channel, self._by_frame = arrays, channel, facts["normalisation"] == "frame"
 
     def reads(self, focal_point: np.ndarray) -> tuple:
         """The rows and columns that `look` reads of a frame, as slices."""
@@ -156,18 +158,17 @@ class Sensor:
 
     def look(self, frame: np.ndarray, focal_point: np.ndarray) -> list[np.ndarray]:
         """The images at a focal point (y, x). The frame is normalised where it is looked at, and only there."""
-        if self._by_frame:
-            frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3))
-        arrays, sensor = self._arrays, self._sensor
+        frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3)) if self._by_frame else frame
+        frame, arrays, sensor = np.atleast_3d(frame)[..., self._channel], self._arrays, self._sensor
         top, left = focal_point - self._window // 2
-        window = self._cut(frame, top, left) - self._cut(arrays["mean"], top, left)
+        window = self._cut(frame, top, left) - self._cut(arrays["mean"][self._channel], top, left)
         if sensor["kind"] == "logpolar":
             values = np.add.reduceat(window.ravel()[arrays["pixel"]] * arrays["weight"], arrays["first"])
             return [values.reshape(sensor["rings"], sensor["wedges"])]
         # A weight divides by the number of pixels and by the deviation; it is 0 where a finer ring lies.
         images = [self._sums(window, *ring) * arrays[f"weight_{i}"] for i, ring in enumerate(sensor["rings"])]
         if sensor["peripheral"]:
-            cells = (self._cells(frame) - arrays["mean_cells"]) * arrays["cell_weight"]
+            cells = (self._cells(frame) - arrays["mean_cells"][self._channel]) * arrays["cell_weight"]
             edges = (arrays["row_edges"], top), (arrays["column_edges"], left)
             rows, columns = ((e[:-1] >= at) & (e[1:] <= at + n) for (e, at), n in zip(edges, self._window, strict=True))
             images.append(cells * ~(rows[:, None] & columns))
@@ -206,12 +207,14 @@ class Sensor:
         return canvas
 
 
-def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray, area: tuple = WHOLE) -> np.ndarray:
-    """A camera's image [h, w] or [h, w, 3] as a gray frame, uint8 [H, W]: area means, rounded half up; 0 elsewhere.
+def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray | None, area: tuple = WHOLE) -> np.ndarray:
+    """A camera's image as a frame, uint8 [H, W] or, without `luma`, [H, W, 3]: area means, rounded half up; 0 elsewhere.
 
     An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
     each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
     """
+    if luma is None:
+        return np.stack([shrink(image[..., i], frame_shape, LUMA, area) for i in range(3)], axis=-1)
     if image.ndim == 3 and any(size < 2 * wanted for size, wanted in zip(image.shape, frame_shape, strict=False)):
         image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
     for axis, wanted in enumerate(frame_shape):

@@ -90,10 +90,10 @@ def _check_files(agent: Agent) -> None:
 
 
 def _check_images(agent: Agent, golden: dict[str, np.ndarray]) -> None:
-    """Camera images become frames as in training, to one gray level."""
+    """Camera images become frames as in training, to one level of 255."""
     camera = Agent(agent.folder, source="camera")
     for name in [name for name in golden if name.startswith("image_")]:
-        frame, wanted = 255 * camera.frame(golden[name]), golden[name.replace("image", "gray")]
+        frame, wanted = 255 * camera.frame(golden[name]), golden[name.replace("image", "frame")]
         difference = np.abs(np.rint(frame) - wanted).max()
         if difference > 1:
-            raise AgentError(f"{name}: becomes a frame that differs by {difference:.0f} gray levels, more than 1")
+            raise AgentError(f"{name}: becomes a frame that differs by {difference:.0f} levels, more than 1")

@@ -151,6 +151,7 @@ def facts(stored: TrainedAgent) -> dict[str, Any]:
         "source": "camera" if agent.crop_top is None else "screen",
         "crop_top": agent.crop_top,
         "frame_shape": list(config.env.frame_shape),
+        "color": config.env.color,
         "normalisation": _normalisation(agent, stored.statistics),
         "sensor": to_mapping(config.sensor),
         "window": list(agent.sensor.window),
@@ -187,15 +188,16 @@ def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
 
 
 def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
-    """What the sensor's arithmetic is made of: the mean frame, and weights that divide by the deviation.
+    """What the sensor's arithmetic is made of: the mean of each channel, and weights that divide by the deviation.
 
     Sensing is linear: what it gives of a normalised frame is what it gives of the difference from the mean, weighted.
     """
     sensor, shape = agent.config.sensor, agent.config.env.frame_shape
-    mean, std = np.zeros(shape, np.float32), 1.0
+    mean, std = np.zeros((*shape, *agent.config.env.pixel_shape), np.float32), 1.0
     if _normalisation(agent, statistics) in ("running", "pixel"):
-        mean = np.array(np.broadcast_to(np.asarray(statistics.mean / statistics.weight), shape))
+        mean = np.array(np.broadcast_to(np.asarray(statistics.mean / statistics.weight), mean.shape))
         std = max(float(statistics.std / statistics.weight), SMALLEST_STD)
+    mean = mean.reshape(*shape, -1).transpose(2, 0, 1)
     found: dict[str, Any] = {"mean": mean}
     if isinstance(sensor, LogPolarSensor):
         cell, pixel, share = geometry.shares(sensor)
@@ -213,9 +215,9 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
     if sensor.peripheral is not None:
         rows, columns = (np.arange(n + 1) * size // n for n, size in zip(sensor.peripheral, shape, strict=True))
         pixels = np.outer(np.diff(rows), np.diff(columns)) if by_mean else np.ones(sensor.peripheral)
-        sums = np.add.reduceat(np.add.reduceat(mean, rows[:-1], 0), columns[:-1], 1)
+        sums = np.add.reduceat(np.add.reduceat(mean, rows[:-1], 1), columns[:-1], 2)
         found |= {"row_edges": rows, "column_edges": columns, "cell_weight": (1 / std / pixels).astype(np.float32)}
-        found["mean_cells"] = sums if by_mean else mean[rows[:-1]][:, columns[:-1]]
+        found["mean_cells"] = sums if by_mean else mean[:, rows[:-1]][..., columns[:-1]]
     if sensor.layout == "canvas":
         painting = tables(packed, shape)
         found |= {"paint_window": painting.window, "paint_background": painting.background}

@@ -7,7 +7,8 @@ import functools
 import jax
 import numpy as np
 
-from foajax.envs.gymnasium import gray_frames
+from foajax.config.schema import EnvConfig
+from foajax.envs.gymnasium import make_frames
 from foajax.runs.agents import TrainedAgent
 from foajax.viewing import games
 
@@ -19,7 +20,7 @@ def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
     """The first `STEPS` / 2 greedy decisions of each of two games, one after the other; each array [STEPS, ...].
 
     `frame` is what the environment shows, uint8, and `is_first` where memory and gaze begin anew. Further arrays
-    `image_<i>` are colour images, uint8 [h, w, 3], and `gray_<i>` the frames that training would make of them.
+    `image_<i>` are colour images, uint8 [h, w, 3], and `frame_<i>` the frames that training would make of them.
 
     Raises:
       ConfigError: the game cannot be played here.
@@ -42,15 +43,16 @@ def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
         timestep, _ = environment.recv()
     environment.close()
     golden = {name: np.concatenate(np.stack(values, axis=1)) for name, values in rows.items()}
-    return golden | _images(stored.agent.config.env.frame_shape, seed)
+    return golden | _images(stored.agent.config.env, seed)
 
 
-def _images(frame_shape: tuple[int, int], seed: int) -> dict[str, np.ndarray]:
+def _images(env: EnvConfig, seed: int) -> dict[str, np.ndarray]:
     """A camera's images, one a little and one much larger than the frame, in no whole proportion to it."""
-    random, arrays = np.random.default_rng(seed), {}
+    frame_shape, random, arrays = env.frame_shape, np.random.default_rng(seed), {}
     for i, (height, width) in enumerate(((9, 3), (frame_shape[0] + 7, 2 * frame_shape[1] + 5))):
         size = frame_shape[0] + height, frame_shape[1] + width
         blocks = random.integers(0, 256, (*(-(-length // _BLOCK) for length in size), 3), np.uint8)
         image = blocks.repeat(_BLOCK, 0).repeat(_BLOCK, 1)[: size[0], : size[1]]
-        arrays[f"image_{i}"], arrays[f"gray_{i}"] = image, gray_frames(image[None], frame_shape)[0]
+        arrays[f"image_{i}"] = image
+        arrays[f"frame_{i}"] = make_frames(image[None], frame_shape, color=env.color)[0]
     return arrays

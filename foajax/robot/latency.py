@@ -53,7 +53,9 @@ print(json.dumps({"start_s": seconds, "memory_mb": int(peak.split()[1]) / 1024})
 """
 
 
-def measure(experiments: Sequence[str], *, torso: str, dtype: str, repeats: int) -> list[dict[str, Any]]:
+def measure(
+    experiments: Sequence[str], *, torso: str, color: bool = False, dtype: str, repeats: int
+) -> list[dict[str, Any]]:
     """One record per experiment, and for `nonfoa`: times by `PARTS`, file, memory, start, and estimates of energy.
 
     Times are medians and 99th percentiles in microseconds. `frame` makes a frame of a screen, `sense` looks at it,
@@ -63,13 +65,16 @@ def measure(experiments: Sequence[str], *, torso: str, dtype: str, repeats: int)
       ConfigError: an unknown name, or an experiment that does not look at Atari's 80x80 frames.
     """
     names = list(dict.fromkeys([*experiments, REFERENCE]))
-    configs = [compose([f"experiment={name}", f"network={torso}"]) for name in names]
+    configs = [compose([f"experiment={name}", f"network={torso}", f"env.color={color}"]) for name in names]
     records = _measure(configs, dtype, repeats)
     reference = records[names.index(REFERENCE)]
     for name, config, record in zip(names, configs, records, strict=True):
         flops = count(config)["decision_flops"]
         record |= {"experiment": name, "dtype": dtype, "decision_flops": flops}
-        for source, size in (("screen", math.prod(SCREEN_SHAPE)), ("camera", math.prod(_IMAGE))):
+        for source, size in (
+            ("screen", math.prod((*SCREEN_SHAPE, *config.env.pixel_shape))),
+            ("camera", math.prod(_IMAGE)),
+        ):
             record[f"{source}_ratio"] = record[f"{source}_us"] / reference[f"{source}_us"]
             record[f"{source}_energy_estimate_uj"] = 1e6 * energy(flops, record["bytes"], size)
     return records
@@ -123,7 +128,7 @@ def _process(path: Path) -> dict[str, float]:
 
 def _calls(module: ModuleType, path: Path, stored: TrainedAgent) -> dict[str, Callable[[], Any]]:
     random = np.random.default_rng(0)
-    screen, image = (random.integers(0, 256, shape, np.uint8) for shape in (SCREEN_SHAPE, _IMAGE))
+    screen, image = (random.integers(0, 256, shape, np.uint8) for shape in (stored.agent.screen_shape, _IMAGE))
     player, watcher = module.Agent(path), module.Agent(path, source="camera", order="bgr")
     frame = player.frame(screen)
     options = onnxruntime.SessionOptions()

@@ -24,7 +24,7 @@ from foajax.config.parse import ConfigError, refuse
 from foajax.learning.agent import Agent
 from foajax.robot.golden import GAMES
 from foajax.runs.agents import TrainedAgent
-from foajax.types import SCREEN_SHAPE, ActorState, TimeStep
+from foajax.types import ActorState, TimeStep
 
 FILE = "decide.stablehlo"
 PLATFORMS = ("cpu", "cuda")
@@ -57,9 +57,8 @@ def inputs(agent: Agent, batch: int) -> Arrays:
     (memory, gaze and last actions of the state are not read then), `seed` that of what is drawn at this step, `greedy`
     whether nothing is drawn; the others are the state.
     """
-    shape = agent.config.env.frame_shape if agent.crop_top is None else SCREEN_SHAPE
     given: Arrays = {
-        "frame": np.zeros((batch, *shape), np.uint8),
+        "frame": np.zeros((batch, *agent.screen_shape), np.uint8),
         "reward": np.zeros(batch, np.float32),
         "is_first": np.ones(batch, bool),
         "seed": np.arange(batch, dtype=np.uint32),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 
 import cv2
 import jax
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from foajax.envs.gymnasium import gray_frames
+from foajax.envs.gymnasium import gray_frames, make_frames
 from foajax.sensors import frames
 from foajax.sensors.sense import sense
 
@@ -42,6 +43,9 @@ EPISODES = {
         *("experiment=constant70_packed", "network.last_actions=false", "network.last_reward=false"),
         *("network.focal_scale=frame", "network.normalization=running"),
     ],
+    "in colour": ["experiment=constant70_p_packed", "env.color=true"],
+    "a canvas in colour": ["experiment=constant70_p", "env.color=true", "network.normalization=frame"],
+    "log-polar in colour": ["experiment=logpolar", "env.color=true", "network.normalization=running"],
     "its own frames": ["experiment=constant50_sub2_packed", "network.normalization=frame", "env.clip_rewards=false"],
 }
 
@@ -68,7 +72,7 @@ def test_it_sees_what_the_sensor_gives_of_normalised_frames(words, normalisation
 @pytest.mark.parametrize("words", EPISODES.values(), ids=EPISODES)
 def test_it_decides_as_the_jax_agent_does(words, make_stored, fill, decisions):
     stored, random = make_stored(*words), np.random.default_rng(2)
-    screens = random.integers(0, 256, (12, 210, 160), np.uint8)
+    screens = random.integers(0, 256, (12, *stored.agent.screen_shape), np.uint8)
     rewards = random.normal(size=12).astype(np.float32)
     is_first = np.isin(np.arange(12), [0, 7])
     agent = Agent(fill(stored), greedy=True)
@@ -150,6 +154,20 @@ def test_only_what_is_looked_at_is_made_of_a_cameras_image(experiment, make_stor
         seen = agent._sensor.look(agent.frame(image, agent._sensor.reads(point)), point)
         for part, expected in zip(seen, agent._sensor.look(whole, point), strict=True):
             np.testing.assert_array_equal(part, expected)
+
+
+@pytest.mark.parametrize("shape", [(480, 641), (97, 131), (80, 80)])
+def test_an_agent_of_colours_looks_through_a_colour_camera(shape, make_stored, fill):
+    path = fill(make_stored("experiment=constant50_sub2_packed", "env.color=true"))
+    image = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    rgb, bgr = (Agent(path, source="camera", order=order) for order in ("rgb", "bgr"))
+    wanted = make_frames(image[None], (80, 80), color=True)[0]
+    difference = np.abs(np.rint(255 * rgb.frame(image)) - wanted)  # exact halves may be rounded the other way
+    assert difference.max() <= 1 and difference.mean() < 0.001
+    np.testing.assert_array_equal(bgr.frame(image[..., ::-1]), rgb.frame(image))
+    for agent, accepted in ((rgb, "[h, w, 3]"), (Agent(path), "[210, 160, 3]")):
+        with pytest.raises(AgentError, match=re.escape(f"frame=uint8 [210, 160]: accepted is uint8 {accepted}")):
+            agent.frame(np.zeros((210, 160), np.uint8))
 
 
 def test_colours_may_come_in_either_order(make_stored, fill):
