@@ -39,6 +39,7 @@ class Options(Section):
     experiments: str | None = Field(None, description="Names with commas between them; null for all.")
     torso: Literal["nature", "a3c"] = Field("nature", description="Choice of the group network/.")
     json_file: str | None = Field(None, alias="json", description="File for the result.")
+    color: bool = Field(False, alias="env.color", description="Frames in colour; else gray.")
     repeats: int = Field(50, ge=1, description="Repeats of each timing.")
     target: Literal["jax", "onnx"] = Field("jax", description="What runs: JAX, or the folders that export writes.")
     dtype: Literal["float32", "float16", "int8"] = Field("float32", description="Of the weights, where target=onnx.")
@@ -56,7 +57,7 @@ def cost(arguments: Sequence[str]) -> None:
         records = _exported(names, options)
         _print_exported(records)
     else:
-        records = measure(names, torso=options.torso, repeats=options.repeats)
+        records = measure(names, torso=options.torso, color=options.color, repeats=options.repeats)
         _print(records)
     if options.json_file:
         bench.write("json", options.json_file, records, ["python", "-m", "foajax.cost", *arguments])
@@ -67,7 +68,9 @@ def _exported(names: Sequence[str], options: Options) -> list[dict[str, Any]]:
         from foajax.robot import latency
     except ImportError as error:
         raise refuse("target", "onnx", "foajax[robot]", why=f"{error.name} is missing") from None
-    return latency.measure(names, torso=options.torso, dtype=options.dtype, repeats=options.repeats)
+    return latency.measure(
+        names, torso=options.torso, color=options.color, dtype=options.dtype, repeats=options.repeats
+    )
 
 
 def _print(records: Sequence[dict[str, Any]]) -> None:

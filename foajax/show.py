@@ -3,7 +3,8 @@
 A row for each focal point: the frame with the focal areas drawn on it, what the sensor gives put back in
 its place, and for a packed layout the images themselves, which is all that the network is given. With
 `sensor=all`, every sensor of the paper and the log-polar one on one sheet. Keys of the sensor change it or
-make one's own: `sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`.
+make one's own: `sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`. With `env.color=true`
+it looks at the screen in colour.
 
 Frames are as the emulator draws them, not normalised, so that black is both black and hidden. The
 brightest pixel of the frame is drawn white.
@@ -35,6 +36,7 @@ class Options(Section):
     game: str = Field("breakout", description="The game whose frame is shown.")
     points: tuple[Point, ...] = Field((), description="Focal points in frame pixels; none for the frame's centre.")
     out: str = Field("show.png", description="The image, a .png file.")
+    color: bool = Field(False, alias="env.color", description="Frames in colour; else gray.")
     steps: int = Field(60, ge=0, description="Random actions before the frame is taken.")
     seed: int = Field(0, description="Seed of the game.")
     all: bool = Field(False, description="The same as sensor=all.")
@@ -45,7 +47,7 @@ class Options(Section):
 
 
 def walk(config: Config, steps: int) -> np.ndarray:
-    """The frame after `steps` random actions, float32 [H, W] in [0, 1]."""
+    """The frame after `steps` random actions, float32 [H, W] or, in colour, [H, W, 3] in [0, 1]."""
     environment = make(config, num_envs=1, seed=config.seed)
     try:
         timestep, _ = environment.reset()
@@ -65,7 +67,7 @@ def show(arguments: Sequence[str]) -> None:
     sheet = options.all or options.sensor == "all"
     if sheet and own:
         raise refuse(own[0], accepted="a key of one sensor, without sensor=all")
-    words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
+    words = [*own, f"game={options.game}", f"seed={options.seed}", f"env.color={options.color}", "gaze=none"]
     configs = {name: compose([f"sensor={name}", *words]) for name in (ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape

@@ -34,7 +34,7 @@ class Subject(NamedTuple):
     calls: dict[str, Callable[[], Any]]  # what is timed, by the name of the result
 
 
-def measure(experiments: Sequence[str], *, torso: str, repeats: int) -> list[dict[str, Any]]:
+def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repeats: int) -> list[dict[str, Any]]:
     """One record an experiment: what is counted, times in microseconds, ratios to `nonfoa`.
 
     `nonfoa` is measured in any case, for the ratios.
@@ -43,7 +43,7 @@ def measure(experiments: Sequence[str], *, torso: str, repeats: int) -> list[dic
       ConfigError: an unknown name.
     """
     names = list(dict.fromkeys([*experiments, REFERENCE]))
-    subjects = [_subject(compose([f"experiment={name}", f"network={torso}"])) for name in names]
+    subjects = [_subject(compose([f"experiment={name}", f"network={torso}", f"env.color={color}"])) for name in names]
     times = _time([subject.calls for subject in subjects], repeats)
     records = [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
     reference = records[names.index(REFERENCE)]
@@ -60,7 +60,7 @@ def measure_decisions(configs: Sequence[Config], *, repeats: int) -> list[dict[s
     return [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
 
 
-def sense(agent: Agent, frame: Float[Array, "B H W"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
+def sense(agent: Agent, frame: Float[Array, "B H W *C"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
     """The sensor's part of a decision."""
     return agent.sense(frame, focal_point)
 
@@ -68,7 +68,7 @@ def sense(agent: Agent, frame: Float[Array, "B H W"], focal_point: Int[Array, "B
 def decide(
     agent: Agent,
     params: Params,
-    roi: tuple[Float[Array, "B _ _ 1"], ...],
+    roi: tuple[Float[Array, "B _ _ _"], ...],
     focal_point: Int[Array, "B 2"],
     core_state: Carry,
     key: PRNGKeyArray,
@@ -89,7 +89,7 @@ def decide(
 def decision(
     agent: Agent,
     params: Params,
-    frame: Float[Array, "B H W"],
+    frame: Float[Array, "B H W *C"],
     focal_point: Int[Array, "B 2"],
     core_state: Carry,
     key: PRNGKeyArray,
@@ -98,7 +98,7 @@ def decision(
     return decide(agent, params, sense(agent, frame, focal_point), focal_point, core_state, key)
 
 
-def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ 1"], ...]) -> list[Array]:
+def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ _"], ...]) -> list[Array]:
     """The convolutions alone, of every image that is large enough for them."""
     module: Any = make_torso(agent.config.network)
     weights = {i: params["params"].get(f"torso_{i}") for i in range(len(roi))}
@@ -154,8 +154,8 @@ def _count(agent: Agent, params: Params) -> dict[str, Any]:
 
 def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, Carry, Array]:
     """A batch of frames of noise, the focal points at their centres."""
-    shape = agent.config.env.frame_shape
-    frame = jnp.asarray(np.random.default_rng(0).normal(size=(batch, *shape)), jnp.float32)
+    shape, pixel = agent.config.env.frame_shape, agent.config.env.pixel_shape
+    frame = jnp.asarray(np.random.default_rng(0).normal(size=(batch, *shape, *pixel)), jnp.float32)
     focal_point = jnp.tile(jnp.array(shape, jnp.int32) // 2, (batch, 1))
     return frame, focal_point, agent.initial_state(batch).core_state, jax.random.key(0)
 

@@ -91,8 +91,8 @@ class Logger:
                 finite = {name: x for name, x in record.items() if x is not None and name != "env_steps"}
                 self._other.log(finite, env_steps)
 
-    def image(self, tag: str, array: UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]) -> None:
-        """An image, gray or colour, 0..255, for TensorBoard; belongs to the last row's ``env_steps``."""
+    def image(self, tag: str, array: UInt8[np.ndarray, "H W *C"]) -> None:
+        """An image, gray or in colour, 0..255, for TensorBoard; belongs to the last row's ``env_steps``."""
         with self._survive("tensorboard"):
             self._events.image(tag, array, self._env_steps)
 

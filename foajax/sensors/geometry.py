@@ -17,7 +17,7 @@ _SAMPLES = 32  # sample points along each side of a cell, to measure how much of
 
 
 class PixelCount(NamedTuple):
-    """How many values a sensor gives of a gray frame."""
+    """How many values a sensor gives of a gray frame, or of each channel of one in colour."""
 
     nominal: int  # as Table II counts: area over factor squared, ring by ring
     actual: int  # values really shown with the gaze at the frame's centre

@@ -38,14 +38,14 @@ def tables(sensor: Sensor, frame_shape: tuple[int, int]) -> Painting:
 
 
 def paint(
-    values: UInt8[np.ndarray, "n"], focal_point: Int[np.ndarray, "2"], painting: Painting
-) -> UInt8[np.ndarray, "H W"]:
+    values: UInt8[np.ndarray, "n *C"], focal_point: Int[np.ndarray, "2"], painting: Painting
+) -> UInt8[np.ndarray, "H W *C"]:
     """The picture of one step's values; 0 where nothing is seen."""
-    values = np.append(values, np.uint8(0))  # what the index -1 finds
+    values = np.concatenate([values, np.zeros_like(values[:1])])  # what the index -1 finds
     image = values[painting.background]
     size = np.array(painting.window.shape)
     first = np.asarray(focal_point) - size // 2
-    low, high = np.maximum(first, 0), np.minimum(first + size, image.shape)
+    low, high = np.maximum(first, 0), np.minimum(first + size, image.shape[:2])
     seen = painting.window[low[0] - first[0] : high[0] - first[0], low[1] - first[1] : high[1] - first[1]]
     image[low[0] : high[0], low[1] : high[1]] = values[seen]
     return image

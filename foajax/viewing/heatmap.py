@@ -34,7 +34,7 @@ class HeatMap:
     """How often the gaze was where."""
 
     counts: Int[np.ndarray, "H W"]  # steps with the focal point at (y, x)
-    mean_frame: Float[np.ndarray, "H W"]  # over the same steps, 0 to 1
+    mean_frame: Float[np.ndarray, "H W *C"]  # over the same steps, 0 to 1
     low: Int[np.ndarray, "2"]  # the smallest and the largest focal point (y, x) that the gaze may have
     high: Int[np.ndarray, "2"]
     games: int

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,7 +46,7 @@ def encode(recording: Recording) -> dict[str, Any]:
     """All of a recording, as the page's script reads it."""
     config, sensor = recording.config, make_sensor(recording.config.sensor).packed
     palette, screens = _screens(recording)
-    values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
+    values = recording.values
     painting = tables(sensor, config.env.frame_shape)
     shape, origin = _shrunk(recording), recording.frame_origin
     scale = shape[0] / recording.screens.shape[0], shape[1] / recording.screens.shape[1]
@@ -63,8 +64,9 @@ def encode(recording: Recording) -> dict[str, Any]:
         "gaze": config.gaze.mode,
         "natural_names": recording.actions,
         "vision_names": names(config.gaze),
-        "images": [part.shape[1:] for part in recording.images],
+        "images": [part.shape[1:3] for part in recording.images],
         "count": values.shape[1],
+        "channels": math.prod(config.env.pixel_shape),
         "white": max(int(values.max()), 1),
         "painting": {"window": painting.window.tolist(), "background": painting.background.tolist()},
         "part": _PART,

@@ -13,12 +13,12 @@ _VIEWS = 6  # of one environment, spread over the rollout
 _GAP = 2
 
 
-def snapshots(rollout: Rollout, frame_shape: tuple[int, int]) -> dict[str, UInt8[np.ndarray, "_ _"]]:
+def snapshots(rollout: Rollout, frame_shape: tuple[int, int]) -> dict[str, UInt8[np.ndarray, "_ _ *C"]]:
     """A heat map of the focal points of all environments, and what the first of them saw, by TensorBoard's names."""
     steps = rollout.steps
     return {
         "gaze/heat_map": heat_map(np.asarray(steps.focal_point).reshape(-1, 2), frame_shape),
-        "gaze/views": views([np.asarray(part)[:, 0, :, :, 0] for part in steps.roi]),
+        "gaze/views": views([np.asarray(part)[:, 0] for part in steps.roi]),
     }
 
 
@@ -29,7 +29,7 @@ def heat_map(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> UI
     return _enlarged(levels)
 
 
-def views(parts: list[Float[np.ndarray, "T _ _"]]) -> UInt8[np.ndarray, "_ _"]:
+def views(parts: list[Float[np.ndarray, "T _ _ C"]]) -> UInt8[np.ndarray, "_ _ C"]:
     """The sensor's images at a few steps, left to right, the parts of each below one another.
 
     Values are normalised frames: the darkest is drawn black and the brightest white.
@@ -39,11 +39,11 @@ def views(parts: list[Float[np.ndarray, "T _ _"]]) -> UInt8[np.ndarray, "_ _"]:
     width = max(part.shape[2] for part in parts)
     rows = []
     for part in parts:
-        margins = [(0, 0), (0, _GAP), (0, width - part.shape[2] + _GAP)]
+        margins = [(0, 0), (0, _GAP), (0, width - part.shape[2] + _GAP), (0, 0)]
         levels = np.pad(255 * (part[chosen] - low) / max(high - low, 1e-6), margins)
         rows.append(np.concatenate(list(levels), axis=1))
     return _enlarged(np.concatenate(rows))
 
 
-def _enlarged(levels: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "_ _"]:
-    return np.kron(np.round(levels).astype(np.uint8), np.ones((_SCALE, _SCALE), np.uint8))
+def _enlarged(levels: Float[np.ndarray, "h w *C"]) -> UInt8[np.ndarray, "_ _ *C"]:
+    return np.round(levels).astype(np.uint8).repeat(_SCALE, 0).repeat(_SCALE, 1)

@@ -63,9 +63,10 @@ class Recording(NamedTuple):
     crop_top: int | None  # screen row at which the frame begins; None where it is the whole screen
     is_over: bool  # False where the recording was cut
     screens: Screens
-    mean_frame: Float[np.ndarray, "H W"]  # over the game, 0 to 1
+    mean_frame: Float[np.ndarray, "H W *C"]  # over the game, 0 to 1
     focal_point: Int[np.ndarray, "N 2"]  # (y, x) in frame pixels
-    images: tuple[UInt8[np.ndarray, "N _ _"], ...]  # the sensor's values in the packed layout, 255 times
+    # The sensor's values in the packed layout, 255 times: [N, h, w] or, in colour, [N, h, w, 3] each.
+    images: tuple[UInt8[np.ndarray, "N _ _ *C"], ...]
     natural_probs: Float[np.ndarray, "N A"]
     natural_value: Float[np.ndarray, "N"]
     natural_action: Int[np.ndarray, "N"]
@@ -76,6 +77,12 @@ class Recording(NamedTuple):
     lives: Int[np.ndarray, "N"] | None  # None where the game has none
     is_first: np.ndarray  # bool [N]: the learner's episode starts, with memory and gaze reset
     facts: dict[str, np.ndarray] | None = None  # about the last episode, where the task tells any
+
+    @property
+    def values(self) -> UInt8[np.ndarray, "N n *C"]:
+        """All images of each step, laid end to end."""
+        parts = [part.reshape(len(part), -1, *self.config.env.pixel_shape) for part in self.images]
+        return np.concatenate(parts, axis=1)
 
     @property
     def life_lost(self) -> np.ndarray:
@@ -127,7 +134,7 @@ def record(
     names = action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
     decide = jax.jit(functools.partial(_decide, stored.agent, greedy))
     for game in range(seed, seed + episodes):
-        environment = games.environment(stored, num_envs=1, seed=game, render=_in_colour(config))
+        environment = games.environment(stored, num_envs=1, seed=game, render=_renders(config))
         try:
             played = _play(environment, stored, decide, jax.random.key(game), max_steps, progress)
         finally:
@@ -154,14 +161,14 @@ def _play(
     """One game: the fields of a recording that come from playing."""
     config, state = stored.agent.config, stored.agent.initial_state(1)
     timestep, outcome = environment.reset()
-    screens, total = Screens(), np.zeros(config.env.frame_shape)
+    screens, total = Screens(), np.zeros((*config.env.frame_shape, *config.env.pixel_shape))
     rows: list[_Row] = []
     scores: list[float] = []
     lives: list[int] = []
     while True:
         step_key = jax.random.fold_in(key, len(rows))
         row, frame, state = decide(stored.params, stored.statistics, state, timestep, step_key)
-        screens.append(environment.render()[0] if _in_colour(config) else _gray(np.asarray(timestep.frame)[0]))
+        screens.append(environment.render()[0] if _renders(config) else _rgb(np.asarray(timestep.frame)[0]))
         scores.append((scores[-1] if scores else 0.0) + float(outcome.score[0]))
         lives.append(0 if environment.lives is None else int(environment.lives[0]))
         rows.append(jax.device_get(row))
@@ -194,17 +201,17 @@ def _decide(
     state: ActorState,
     timestep: TimeStep,
     key: PRNGKeyArray,
-) -> tuple[_Row, Float[Array, "H W"], ActorState]:
+) -> tuple[_Row, Float[Array, "H W *C"], ActorState]:
     """One decision, with the frame and what the packed sensor gives of it before normalisation."""
     output, network, state = agent.act(params, statistics, state, timestep, key, greedy=greedy)
     frame = agent.frame(timestep.frame)[0]
     images = sense(frame, output.focal_point[0], sensor=agent.sensor.packed)
-    levels = [jnp.round(255 * image[..., 0]).astype(jnp.uint8) for image in images]
+    levels = [jnp.round(255 * image.reshape(*image.shape[:2], *frame.shape[2:])).astype(jnp.uint8) for image in images]
     return _Row(output._replace(roi=(), frames=()), network, levels), frame, state
 
 
-def _in_colour(config: Config) -> bool:
-    """Whether the engine can show screens in colour; ale-py's vector environment keeps gray ones only."""
+def _renders(config: Config) -> bool:
+    """Whether the engine can show its screens in colour; ale-py's vector environment has those of the frames alone."""
     return config.env.engine != "ale" or not is_atari(config)
 
 
@@ -234,8 +241,8 @@ def _softmax(logits: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
     return exponentials / exponentials.sum(axis=-1, keepdims=True)
 
 
-def _gray(screen: np.ndarray) -> np.ndarray:
-    return np.repeat(screen[..., None], 3, axis=-1)
+def _rgb(screen: np.ndarray) -> np.ndarray:
+    return screen if screen.ndim == 3 else np.repeat(screen[..., None], 3, axis=-1)
 
 
 def watch(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:

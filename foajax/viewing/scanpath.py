@@ -97,7 +97,7 @@ def _tiles(recording: Recording, points: Int[np.ndarray, "N 2"], stays: Sequence
     sensor = make_sensor(recording.config.sensor).packed
     frame_shape = recording.config.env.frame_shape
     painting = tables(sensor, frame_shape)
-    values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
+    values = recording.values
     white = max(int(values.max()), 1)
     shown = sensor.areas[min(1, len(sensor.areas) - 1)]
     tiles = []

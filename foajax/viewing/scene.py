@@ -34,7 +34,7 @@ class Scene:
         self._recording = recording
         self._sensor = make_sensor(recording.config.sensor).packed
         self._painting = tables(self._sensor, recording.config.env.frame_shape)
-        self._values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
+        self._values = recording.values
         self._white = max(int(self._values.max()), 1)  # of the whole game, so that nothing flickers
         self._scale = _fit(recording.screens.shape[:2], (_TALL, _VIEW))
         self._chart = _chart(recording)
@@ -92,14 +92,14 @@ class Scene:
         """The values put back in the frame's place, and below them the images as the network gets them."""
         recording = self._recording
         picture = paint(self._values[step], recording.focal_point[step], self._painting)
-        view = _enlarge(self._bright(picture), _fit(picture.shape, (_VIEW, _VIEW)))
+        view = _enlarge(self._bright(picture), _fit(picture.shape[:2], (_VIEW, _VIEW)))
         image.paste(view, (self._view_left, _TOP))
-        if len(recording.images) == 1 and recording.images[0].shape[1:] == recording.config.env.frame_shape:
+        if len(recording.images) == 1 and recording.images[0].shape[1:3] == recording.config.env.frame_shape:
             return  # the whole frame: the same picture once more
         pen, left, top = ImageDraw.Draw(image), self._view_left, _TOP + view.height + 6
         pen.text((left, top), "the same values, each once", fill=_FAINT, font=_font(12))
         for part in recording.images:
-            small = _enlarge(self._bright(part[step]), _fit(part.shape[1:], (_TALL - _VIEW - 26, 110)))
+            small = _enlarge(self._bright(part[step]), _fit(part.shape[1:3], (_TALL - _VIEW - 26, 110)))
             image.paste(small, (left, top + 20))
             left += small.width + 8
 

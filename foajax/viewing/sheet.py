@@ -39,7 +39,7 @@ def draw(frame: np.ndarray, sensor: Sensor, points: Sequence[tuple[int, int]], *
     """One sensor on one frame: a heading and a row for each focal point.
 
     Args:
-      frame: float32 [H, W] in [0, 1].
+      frame: float32 [H, W] or [H, W, 3] in [0, 1].
       sensor: what to look through.
       points: (y, x) in frame pixels, inside the frame.
       name: of the sensor, for the heading.
@@ -66,20 +66,20 @@ def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[P
     white = float(frame.max()) or 1.0
     panels = [
         (f"frame, gaze at y {point[0]}, x {point[1]}", _marked(frame / white, sensor, point)),
-        ("what the sensor shows", _grey(np.asarray(seen)[..., 0] / white)),
+        ("what the sensor shows", _image(np.asarray(seen) / white)),
     ]
     if sensor.in_place:
         return panels
     for i, image in enumerate(images):
         caption = f"image {i}: {image.shape[0]} x {image.shape[1]}"
-        panels.append((caption, _grey(np.asarray(image)[..., 0] / white)))
+        panels.append((caption, _image(np.asarray(image) / white)))
     return panels
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _look(
-    frame: Float[Array, "H W"], focal_point: Int[Array, "2"], sensor: Sensor
-) -> tuple[tuple[Float[Array, "_ _ 1"], ...], Float[Array, "H W 1"]]:
+    frame: Float[Array, "H W *C"], focal_point: Int[Array, "2"], sensor: Sensor
+) -> tuple[tuple[Float[Array, "_ _ _"], ...], Float[Array, "H W _"]]:
     """What the sensor gives, and that put back in its place."""
     images = sense(frame, focal_point, sensor=sensor)
     shape = (frame.shape[0], frame.shape[1])
@@ -88,17 +88,18 @@ def _look(
 
 def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.Image:
     """The frame with the focal areas and the focal point drawn on it."""
-    image = _grey(frame)
+    image = _image(frame)
     scale = image.width // frame.shape[1]
     draw_gaze(image, sensor, point, scale=(scale, scale))
     return image
 
 
-def _grey(values: np.ndarray) -> Image.Image:
-    """Values in [0, 1] as an image, each a square of pixels."""
-    scale = max(1, _SIDE // max(values.shape))
-    levels = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    image = Image.fromarray(levels).convert("RGB")
+def _image(values: np.ndarray) -> Image.Image:
+    """Values [h, w], [h, w, 1] or [h, w, 3] in [0, 1] as an image, each a square of pixels."""
+    height, width = values.shape[:2]
+    scale = max(1, _SIDE // max(height, width))
+    levels = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8).reshape(height, width, -1)
+    image = Image.fromarray(np.ascontiguousarray(np.broadcast_to(levels, (height, width, 3))))
     return image.resize((scale * image.width, scale * image.height), Image.Resampling.NEAREST)
 
 
@@ -119,7 +120,7 @@ def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
     """The sensor's name, and its pixel budget as Table II counts it."""
     count = sensor.count((frame.shape[0], frame.shape[1]))
     shown = "" if count.actual == count.nominal else f" ({count.actual:,} shown)"
-    return name, f"{count.nominal:,} values{shown}, {100 * count.nominal / frame.size:.0f}% of the frame"
+    return name, f"{count.nominal:,} values{shown}, {100 * count.nominal / np.prod(frame.shape[:2]):.0f}% of the frame"
 
 
 def _headed(image: Image.Image, title: str, note: str) -> Image.Image:

@@ -15,11 +15,11 @@ def test_the_heat_map_is_brightest_where_the_gaze_is_most():
 
 
 def test_views_lie_side_by_side_and_parts_below_one_another():
-    fine, coarse = np.zeros((11, 3, 4), np.float32), np.zeros((11, 2, 2), np.float32)
-    fine[:] = np.arange(11)[:, None, None]  # brighter with every step
+    fine, coarse = np.zeros((11, 3, 4, 1), np.float32), np.zeros((11, 2, 2, 1), np.float32)
+    fine[:] = np.arange(11)[:, None, None, None]  # brighter with every step
     coarse[10] = -2
     image = views([fine, coarse])
-    assert image.shape == (4 * (3 + 2 + 2 + 2), 4 * 6 * (4 + 2))
+    assert image.shape == (4 * (3 + 2 + 2 + 2), 4 * 6 * (4 + 2), 1)
     for column, step in enumerate((0, 2, 4, 6, 8, 10)):
         assert (image[:12, 24 * column : 24 * column + 16] == round(255 * (step + 2) / 12)).all()
     assert (image[20:28, 120:128] == 0).all() and (image[20:28, :8] == round(255 * 2 / 12)).all()
