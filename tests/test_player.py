@@ -11,11 +11,13 @@ import pytest
 from browser import browser_needed, opened_page
 
 from foajax import cli, player
+from foajax.config.compose import compose
+from foajax.learning.agent import Agent
 from foajax.sensors import gaze
 from foajax.sensors.reconstruct import paint, tables
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import player_page
-from foajax.viewing.recording import Screens
+from foajax.viewing.recording import Screens, record
 
 ARTEFACTS = Path(__file__).resolve().parent.parent / "build"
 GAZE = """() => {  // centre of all that is drawn in the colour of the focal point, in CSS pixels
@@ -59,16 +61,26 @@ def test_the_player(recording, tmp_path):
         page.screenshot(path=ARTEFACTS / "player.png")
 
 
+@pytest.mark.slow
+@browser_needed
+def test_the_player_shows_colours(untrained, tmp_path):
+    words = ["experiment=constant70_p_packed", "env.color=true", "network.dense=8", "network.lstm=8"]
+    game = next(record(untrained(Agent(compose(words), 4, 34)), max_steps=130))
+    assert np.ptp(game.values, axis=-1).max() > 100
+    with opened(player_page.write_page(game, tmp_path)) as page:
+        pictures_are_what_was_recorded(page, game)
+
+
 def pictures_are_what_was_recorded(page, recording):
-    values = np.concatenate([part.reshape(len(part), -1) for part in recording.images], axis=1)
+    values = recording.values
     painting = tables(make_sensor(recording.config.sensor).packed, recording.config.env.frame_shape)
     for step in (119, 0, 60, 59, 129):  # parts of 60 steps begin and end here
         go(page, step)
         screen = np.array(page.evaluate(PIXELS, "screen")).reshape(210, 160, 4)
         np.testing.assert_array_equal(screen[..., :3], recording.screens[step])
-        view = np.array(page.evaluate(PIXELS, "view")).reshape(80, 80, 4)[..., 0]
-        picture = paint(values[step], recording.focal_point[step], painting)
-        np.testing.assert_array_equal(view, picture.astype(int) * 255 // values.max())
+        view = np.array(page.evaluate(PIXELS, "view")).reshape(80, 80, 4)[..., :3]
+        picture = paint(values[step], recording.focal_point[step], painting).reshape(80, 80, -1)
+        np.testing.assert_array_equal(view, np.broadcast_to(picture.astype(int) * 255 // values.max(), view.shape))
 
 
 def numbers_are_what_was_recorded(page, recording):

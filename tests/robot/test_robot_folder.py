@@ -79,6 +79,15 @@ def test_it_checks_itself_without_jax_and_foajax(missing, exported):
     assert ended.stderr == ""
 
 
+@pytest.mark.slow
+def test_an_agent_of_colours_is_exported_and_checks_itself(make_stored, tmp_path):
+    stored = make_stored("experiment=constant70_p_packed", "env.color=true")
+    said = folder.write(stored, tmp_path / "robot", source="x", with_stablehlo=True)
+    assert said.startswith("200 steps: 100.0% of the actions as recorded")
+    with np.load(tmp_path / "robot" / "golden.npz") as arrays:
+        assert arrays["frame"].shape == (golden.STEPS, 210, 160, 3)
+
+
 def test_the_code_is_short():
     for name in folder.CODE:
         text = (Path(folder.__file__).parent / name).read_text()
