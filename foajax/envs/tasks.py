@@ -29,7 +29,7 @@ class Task(NamedTuple):
     # What an action leads to: the next state, the reward in [-1, 1], and whether nothing follows.
     # One that reads the gaze is told, too, at which focal point (y, x) the screen was sensed that was decided upon.
     advance: Callable[..., tuple[TaskState, Float[Array, ""], Bool[Array, ""]]]
-    draw: Callable[[TaskState], UInt8[Array, "H W"]]  # the screen, gray, 0..255
+    draw: Callable[[TaskState], UInt8[Array, "H W *C"]]  # the screen, 0..255, gray or RGB
     reads_gaze: bool = False
     facts: Callable[[TaskState], dict[str, Array]] | None = None  # about the episode, for measures
     # The first state of an episode, from the last one of the episode before; None where episodes are independent.

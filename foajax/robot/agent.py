@@ -208,7 +208,7 @@ class Sensor:
 
 
 def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray | None, area: tuple = WHOLE) -> np.ndarray:
-    """A camera's image as a frame, uint8 [H, W] or, without `luma`, [H, W, 3]: area means, rounded half up; 0 elsewhere.
+    """A camera's image as a frame, uint8 [H, W] or, without luma, [H, W, 3]: area means, rounded half up; 0 elsewhere.
 
     An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
     each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.

@@ -1,6 +1,6 @@
 """The network as an ONNX graph, written from its parameters: one decision, with the recurrent state in and out.
 
-Inputs: one image a sensor part, [batch, 1, h, w], normalised; `side` [batch, S] where the core is told something
+Inputs: one image a sensor part, [batch, C, h, w], normalised; `side` [batch, S] where the core is told something
 beside the images; one state of the core each. Outputs: logits [batch, actions] and value [batch, 1] of each head, and
 the next state. The batch is free. Episodes are the caller's: a state of zeros begins one.
 """

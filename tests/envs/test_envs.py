@@ -441,10 +441,14 @@ def test_the_pure_functions_scanned_are_the_host_environment():
         np.testing.assert_array_equal(getattr(steps, name), getattr(host, name)[1:, 0])
 
 
-def test_jax_environments_render_gray():
-    environment = make(config("seek"), num_envs=2, seed=0)
+@pytest.mark.parametrize("pixel", [(), (3,)], ids=["gray", "colour"])
+def test_jax_environments_render_what_they_draw(pixel):
+    task = probes.PROBES["observation"]((8, 9))
+    task = task._replace(draw=lambda state: jnp.full((8, 9, *pixel), 7 * state.cue, jnp.uint8))
+    environment = tasks.JaxEnvironment(task, num_envs=2, seed=0)
     timestep, _ = environment.reset()
-    np.testing.assert_array_equal(environment.render(), np.stack([timestep.frame] * 3, axis=-1))
+    assert timestep.frame.shape == (2, 8, 9, *pixel)
+    np.testing.assert_array_equal(environment.render(), timestep.frame.reshape(2, 8, 9, -1) + np.zeros(3, np.uint8))
 
 
 # --- Gymnasium --------------------------------------------------------------------------------------------------------
