@@ -213,21 +213,20 @@ def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray | Non
     An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
     each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
     """
-    if luma is None:
-        return np.stack([shrink(image[..., i], frame_shape, LUMA, area) for i in range(3)], axis=-1)
-    if image.ndim == 3 and any(size < 2 * wanted for size, wanted in zip(image.shape, frame_shape, strict=False)):
+    is_small = any(size < 2 * wanted for size, wanted in zip(image.shape, frame_shape, strict=False))
+    if is_small and image.ndim == 3 and luma is not None:
         image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
     for axis, wanted in enumerate(frame_shape):
         if image.shape[axis] < wanted:
             image = image.repeat(-(-wanted // image.shape[axis]), axis)
     axes = zip(image.shape, frame_shape, area, strict=False)
     means = _add_up(image, [_spans(size, wanted, *part.indices(wanted)[:2]) for size, wanted, part in axes], luma)
-    frame = np.zeros(tuple(frame_shape), np.uint8)
+    frame = np.zeros((*frame_shape, *means.shape[2:]), np.uint8)
     frame[area] = np.floor(means + np.float32(0.5))
     return frame
 
 
-def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray) -> np.ndarray:
+def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray | None) -> np.ndarray:
     # The first step reads every byte, and so it adds up before colours are mixed. No matrix products here: their
     # threads would wait for each other. `_share` needs a spare sum at the end.
     (first, shared, part, height), (left, divided, piece, width) = spans
@@ -241,12 +240,16 @@ def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray) -> np.n
         else:
             sums[i] = rows.sum(0, np.uint32)
     sums[count], sums[count + 1 :] = 0, image[first[shared]]
-    if image.ndim == 3:
+    if image.ndim == 3 and luma is not None:
         sums = cv2.transform(sums, luma[None]) if cv2 else sum(sums[..., i] * luma[i] for i in range(3))
-    strips = _share(sums[: count + 1], sums[count + 1 :], shared, part)[:-1]
-    sums = np.zeros((len(left), count), np.float32)
+    flat, colors = sums.reshape(len(sums), -1), sums.shape[2:]
+    strips = _share(flat[: count + 1], flat[count + 1 :], shared, part)[:-1]
+    if colors:  # one channel below the other
+        strips = strips.reshape(count, -1, 3).transpose(2, 0, 1).reshape(3 * count, -1)
+    sums = np.zeros((len(left), len(strips)), np.float32)
     sums[:-1] = np.add.reduceat(strips[:, : left[-1]], left[:-1], 1).T
-    return _share(sums, strips.T[left[divided]], divided, piece)[:-1].T * np.float32(height * width)
+    means = _share(sums, strips.T[left[divided]], divided, piece)[:-1].T * np.float32(height * width)
+    return means.reshape(3, count, -1).transpose(1, 2, 0) if colors else means
 
 
 def halve(screen: np.ndarray, crop_top: int) -> np.ndarray:

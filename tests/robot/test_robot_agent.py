@@ -141,22 +141,25 @@ def test_camera_images_become_the_frames_of_training(shape, colours, opencv, mon
     assert (robot.shrink(image, (80, 80), robot.LUMA, part) == blank).all()
 
 
+@pytest.mark.parametrize("color", [False, True])
 @pytest.mark.parametrize(
     "experiment", ["constant50_sub2_packed", "constant70_p_packed", "decreasing", "search_logpolar"]
 )
-def test_only_what_is_looked_at_is_made_of_a_cameras_image(experiment, make_stored, fill):
-    agent = Agent(fill(make_stored(f"experiment={experiment}", "gaze.bounds=point")), source="camera")
+def test_only_what_is_looked_at_is_made_of_a_cameras_image(experiment, color, make_stored, fill):
+    words = [f"experiment={experiment}", "gaze.bounds=point", f"env.color={color}"]
+    agent = Agent(fill(make_stored(*words)), source="camera")
     shape = agent.facts["frame_shape"]
     image = np.random.default_rng(0).integers(0, 256, (2 * shape[0] + 31, 3 * shape[1] + 7, 3), np.uint8)
     whole = agent.frame(image)
     for point in ([0, 0], [shape[0] // 2, shape[1] // 2], [shape[0] - 1, 5]):
         point = np.array(point)
-        seen = agent._sensor.look(agent.frame(image, agent._sensor.reads(point)), point)
-        for part, expected in zip(seen, agent._sensor.look(whole, point), strict=True):
-            np.testing.assert_array_equal(part, expected)
+        for sensor in agent._sensors:
+            seen = sensor.look(agent.frame(image, sensor.reads(point)), point)
+            for part, expected in zip(seen, sensor.look(whole, point), strict=True):
+                np.testing.assert_array_equal(part, expected)
 
 
-@pytest.mark.parametrize("shape", [(480, 641), (97, 131), (80, 80)])
+@pytest.mark.parametrize("shape", [(480, 641), (97, 131), (60, 400), (80, 80)])
 def test_an_agent_of_colours_looks_through_a_colour_camera(shape, make_stored, fill):
     path = fill(make_stored("experiment=constant50_sub2_packed", "env.color=true"))
     image = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
