@@ -135,7 +135,7 @@ def _calls(module: ModuleType, path: Path, stored: TrainedAgent) -> dict[str, Ca
     options.intra_op_num_threads, options.log_severity_level = 1, 3
     calls: dict[str, Callable[[], Any]] = {
         "frame": lambda: player.frame(screen),
-        "sense": lambda: player._sensor.look(frame, player.focal_point),
+        "sense": lambda: [sensor.look(frame, player.focal_point) for sensor in player._sensors],
     }
     model = onnx.load(path / "policy.onnx")
     images = [value.name for value in model.graph.input if value.name.startswith("image_")]
