@@ -11,6 +11,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,35 +23,40 @@ FRAME_SKIP, NOOPS, MOST_STEPS = 4, 30, 27_000
 def play(agent, emulator: ALEInterface, actions: list[Action], random: np.random.Generator) -> tuple[float, int]:
     """One whole game: its unclipped score and how many decisions it took."""
     emulator.reset_game()
-    screen, reward = begin(emulator, actions, int(random.integers(NOOPS + 1)))
+    see = emulator.getScreenRGB if agent.facts["color"] else emulator.getScreenGrayscale
+    screen, reward = begin(emulator, see, actions, int(random.integers(NOOPS + 1)))
     agent.reset()
     score, steps, lives = reward, 0, emulator.lives()
     reward = 0.0
     while not emulator.game_over() and steps < MOST_STEPS:
         natural, _ = agent.decide(screen, reward)
-        screen, reward = step(emulator, actions[natural])
+        screen, reward = step(emulator, see, actions[natural])
         score, steps = score + reward, steps + 1
         if emulator.lives() < lives and not emulator.game_over():
-            screen, gained = begin(emulator, actions, 0)
+            screen, gained = begin(emulator, see, actions, 0)
             agent.reset()
             score, reward = score + gained, 0.0
         lives = emulator.lives()
     return score, steps
 
 
-def begin(emulator: ALEInterface, actions: list[Action], noops: int) -> tuple[np.ndarray, float]:
+def begin(
+    emulator: ALEInterface, see: Callable[[], np.ndarray], actions: list[Action], noops: int
+) -> tuple[np.ndarray, float]:
     """No-ops, a frame each, then FIRE where the game has it: the first screen, and what was earned meanwhile."""
     reward = float(sum(emulator.act(Action.NOOP) for _ in range(noops)))
-    screen, gained = step(emulator, Action.FIRE if Action.FIRE in actions else Action.NOOP, frames=1)
+    screen, gained = step(emulator, see, Action.FIRE if Action.FIRE in actions else Action.NOOP, frames=1)
     return screen, reward + gained
 
 
-def step(emulator: ALEInterface, action: Action, frames: int = FRAME_SKIP) -> tuple[np.ndarray, float]:
-    """Holds an action for some frames: the brighter pixels of the last two, gray, uint8 [210, 160], and the reward."""
+def step(
+    emulator: ALEInterface, see: Callable[[], np.ndarray], action: Action, frames: int = FRAME_SKIP
+) -> tuple[np.ndarray, float]:
+    """Holds an action for some frames: the brighter pixels of the last two, as the agent sees them, and the reward."""
     screens, reward = [], 0.0
     for _ in range(frames):
         reward += emulator.act(action)
-        screens.append(emulator.getScreenGrayscale())
+        screens.append(see())
         if emulator.game_over():
             break
     return np.maximum.reduce(screens[-2:]), reward

@@ -150,11 +150,8 @@ class Sensor:
 
     def reads(self, focal_point: np.ndarray) -> tuple:
         """The rows and columns that `look` reads of a frame, as slices."""
-        if self._by_frame or self._sensor.get("peripheral"):
-            return WHOLE
-        corner = focal_point - self._window // 2
-        (top, left), (bottom, right) = np.clip([corner, corner + self._window], 0, self._shape)
-        return slice(top, bottom), slice(left, right)
+        whole, corner = self._by_frame or self._sensor.get("peripheral"), focal_point - self._window // 2
+        return WHOLE if whole else tuple(map(slice, *np.clip([corner, corner + self._window], 0, self._shape)))
 
     def look(self, frame: np.ndarray, focal_point: np.ndarray) -> list[np.ndarray]:
         """The images at a focal point (y, x). The frame is normalised where it is looked at, and only there."""
@@ -213,8 +210,7 @@ def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray | Non
     An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
     each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
     """
-    is_small = any(size < 2 * wanted for size, wanted in zip(image.shape, frame_shape, strict=False))
-    if is_small and image.ndim == 3 and luma is not None:
+    if image.ndim == 3 and luma is not None and np.any(np.array(image.shape[:2]) < 2 * np.array(frame_shape)):
         image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
     for axis, wanted in enumerate(frame_shape):
         if image.shape[axis] < wanted:
@@ -244,8 +240,7 @@ def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray | None) 
         sums = cv2.transform(sums, luma[None]) if cv2 else sum(sums[..., i] * luma[i] for i in range(3))
     flat, colors = sums.reshape(len(sums), -1), sums.shape[2:]
     strips = _share(flat[: count + 1], flat[count + 1 :], shared, part)[:-1]
-    if colors:  # one channel below the other
-        strips = strips.reshape(count, -1, 3).transpose(2, 0, 1).reshape(3 * count, -1)
+    strips = strips.reshape(count, -1, 3).transpose(2, 0, 1).reshape(3 * count, -1) if colors else strips
     sums = np.zeros((len(left), len(strips)), np.float32)
     sums[:-1] = np.add.reduceat(strips[:, : left[-1]], left[:-1], 1).T
     means = _share(sums, strips.T[left[divided]], divided, piece)[:-1].T * np.float32(height * width)
