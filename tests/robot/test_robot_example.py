@@ -45,22 +45,28 @@ class Emulator:
     def getScreenGrayscale(self):
         return np.full((210, 160), self.frames, np.uint8)
 
+    def getScreenRGB(self):
+        return np.full((210, 160, 3), self.frames, np.uint8)
+
 
 class Agent:
-    def __init__(self):
+    def __init__(self, color):
+        self.facts, self.shape = {"color": color}, (210, 160, 3)[: 2 + color]
         self.seen, self.resets, self.rewards = [], 0, []
 
     def reset(self):
         self.resets += 1
 
     def decide(self, screen, reward):
+        assert screen.shape == self.shape
         self.seen.append(int(screen.max()))
         self.rewards.append(reward)
         return 1, 0
 
 
-def test_lives_begin_with_fire_and_an_agent_that_is_reset(example):
-    emulator, agent = Emulator(), Agent()
+@pytest.mark.parametrize("color", [False, True])
+def test_lives_begin_with_fire_and_an_agent_that_is_reset(example, color):
+    emulator, agent = Emulator(), Agent(color)
     random = types.SimpleNamespace(integers=lambda bound: 0)  # no no-ops
     actions = [example.Action.NOOP, example.Action.LEFT, example.Action.FIRE]
     score, steps = example.play(agent, emulator, actions, random)
