@@ -6,9 +6,13 @@ import os
 import signal
 
 # Before anything imports jax, and for the processes that tests start. Compilation is most of what tests cost, and what
-# they compile runs but a few times: LLVM optimises nothing, in one piece.
+# they compile runs but a few times: LLVM optimises nothing, in one piece, and XLA's older emitters are twice as fast.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters",
+)
 
 import jax
 import noise
@@ -41,6 +45,19 @@ def no_process_is_left():
         if process.poll() is None:
             process.kill()
             process.communicate()  # closes its pipes: what is collected later is a later test's warning
+
+
+@pytest.fixture
+def command(capsys):
+    """Trains in this process, which has imported what a new one would have to: exit code, stdout, stderr."""
+    from foajax.launch import launch
+    from foajax.train import train
+    from foajax.training.start import check
+
+    def finish(*words):
+        return launch.run(train, words, check=check), *capsys.readouterr()
+
+    return finish
 
 
 @pytest.fixture(scope="session")

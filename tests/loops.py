@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import numpy as np
 
 from foajax.config import compose
+from foajax.config.parse import replace
 from foajax.envs.make import make_environments
 from foajax.learning import learner
 from foajax.learning.agent import Agent
@@ -24,18 +27,25 @@ SMALL = [
 VIEW = ["sensor=rings", "sensor.rings=[[80,80,8]]", "sensor.layout=packed", "experiment=nonfoa"]
 
 
+@functools.cache
+def built(config, num_actions, crop_top):
+    """The agent and its compiled functions: both programs, the loss, the network unrolled."""
+    agent = Agent(config, num_actions, crop_top)
+    loss = jax.jit(lambda params, rollout: learner.loss(params, agent, rollout))
+    return agent, make_programs(agent), loss, jax.jit(agent.unroll)
+
+
 class Loop:
-    """A run without its outside: environments, both programs, the state."""
+    """A run without its outside: environments, both programs, the state. Another seed has the same programs."""
 
     def __init__(self, *overrides):
         self.config = compose.compose([*SMALL, *overrides])
         environments = make_environments(self.config, 0)
-        self.agent = Agent(self.config, environments[0].num_actions, environments[0].crop_top)
-        self.programs = make_programs(self.agent)
+        without_seed = replace(self.config, seed=0)
+        parts = built(without_seed, environments[0].num_actions, environments[0].crop_top)
+        self.agent, self.programs, self.loss, self.unroll = parts
         self.state = make_state(self.agent, self.config.seed)
         self.collector = Collector(self.agent, self.programs, environments, seed=self.config.seed)
-        self.loss = jax.jit(lambda params, rollout: learner.loss(params, self.agent, rollout))
-        self.unroll = jax.jit(self.agent.unroll)
         self.step = 0
         self.metrics = []
 

@@ -15,24 +15,12 @@ from processes import TINY, finish, has_rows, rows, start, wait_for
 
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
-from foajax.launch import launch
 from foajax.launch.processes import Job
 from foajax.runs.agents import load_agent, save_agent
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import load_config, open_run
 from foajax.train import train
 from foajax.training.run import Run
-from foajax.training.start import check
-
-
-@pytest.fixture
-def command(capsys):
-    """Runs the command in this process, which has imported it already: exit code, stdout, stderr."""
-
-    def finish(*words):
-        return launch.run(train, words, check=check), *capsys.readouterr()
-
-    return finish
 
 
 def same(one, other):
@@ -75,15 +63,6 @@ def test_the_same_seed_gives_the_same_hundred_updates_on_the_emulators_too(break
     assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in again.items() if k != "time"}
 
 
-def test_a_finished_run_goes_on_when_more_is_asked_for(breakout, tmp_path):
-    run = shutil.copytree(breakout[0], tmp_path / "run")
-    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", "train.env_steps=1200")
-    assert code == 0, err
-    assert "resumed at 1,000 env_steps (episodes start anew, emulators cannot be saved)" in out
-    steps = [row["env_steps"] for row in rows(run)]
-    assert steps == sorted(set(steps)) and steps[-1] == 1200
-
-
 LOGGER = """
 class Log:
     def __init__(self, config, fails_at):
@@ -99,16 +78,30 @@ class Log:
 """
 
 
-def test_a_logger_of_ones_own_gets_each_row_and_ends_no_run(breakout, tmp_path):
-    run = shutil.copytree(breakout[0], tmp_path / "run")
-    (tmp_path / "mine.py").write_text(LOGGER)
+@pytest.fixture(scope="module")
+def longer(breakout, tmp_path_factory):
+    """The same run, of which more was asked, with a logger of one's own that fails."""
+    directory = tmp_path_factory.mktemp("longer")
+    run = shutil.copytree(breakout[0], directory / "run")
+    (directory / "mine.py").write_text(LOGGER)
     words = ["train.env_steps=1200", "train.logger=mine:Log", "train.logger_kwargs.fails_at=1120"]
-    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", *words, cwd=tmp_path)
+    code, out, err = finish("experiment=constant50_sub2_packed", *TINY, f"run={run}", *words, cwd=directory)
     assert code == 0, err
+    return run, out
+
+
+def test_a_finished_run_goes_on_when_more_is_asked_for(longer):
+    run, out = longer
+    assert "resumed at 1,000 env_steps (episodes start anew, emulators cannot be saved)" in out
+    steps = [row["env_steps"] for row in rows(run)]
+    assert steps == sorted(set(steps)) and steps[-1] == 1200
+
+
+def test_a_logger_of_ones_own_gets_each_row_and_ends_no_run(longer):
+    run, out = longer
     assert out.count("warning: train.logger fails (no network); training goes on") == 1
     logged = [(row["env_steps"], row["loss"]) for row in rows(run) if 1000 < row["env_steps"] < 1120]
     assert [tuple(map(float, line.split())) for line in (run / "log.txt").read_text().splitlines()] == logged != []
-    assert rows(run)[-1]["env_steps"] == 1200
 
 
 def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(breakout, tmp_path):
@@ -192,13 +185,13 @@ def test_another_process_finds_all_compiled_programs(tmp_path):
     assert found[0] == found[1]
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path, command):
     words = ["game=seek", *TINY]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert finish(*words, f"run={whole}", "train.env_steps=1600")[0] == 0
-    for env_steps in (600, 1600):
-        code, out, err = finish(*words, f"run={parts}", f"train.env_steps={env_steps}")
-        assert code == 0, err
+    assert command(*words, f"run={whole}", "train.env_steps=1600")[0] == 0
+    assert command(*words, f"run={parts}", "train.env_steps=600")[0] == 0
+    code, out, err = finish(*words, f"run={parts}", "train.env_steps=1600")  # another process
+    assert code == 0, err
     assert "resumed at 600 env_steps (episodes go on)" in out
     a, b = load_agent(whole), load_agent(parts)
     same(a, b)
@@ -206,7 +199,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
     assert {k: v for k, v in last.items() if k != "time"} == {k: v for k, v in resumed.items() if k != "time"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+OTHERS = [pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGUSR1)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, *OTHERS])
 def test_a_signal_saves_and_ends_well(tmp_path, number):
     process = start("game=seek", *TINY, f"run={tmp_path}", "train.env_steps=100000000")
     wait_for(lambda: has_rows(tmp_path), process)
@@ -220,10 +216,10 @@ def test_a_signal_saves_and_ends_well(tmp_path, number):
     assert rows(tmp_path)[-1]["env_steps"] == saved
 
 
-def test_two_processes_do_not_share_a_run(tmp_path):
+def test_two_processes_do_not_share_a_run(tmp_path, command):
     process = start("game=seek", *TINY, f"run={tmp_path}", "train.env_steps=100000000")
     wait_for(lambda: (tmp_path / "lock").exists() and (tmp_path / "lock").read_text(), process)
-    code, _, err = finish("game=seek", *TINY, f"run={tmp_path}")
+    code, _, err = command("game=seek", *TINY, f"run={tmp_path}")
     process.kill()
     process.communicate()
     assert code == 2 and len(err.splitlines()) == 1 and f"in use by process {process.pid}" in err

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from scipy import stats
+from scipy import special
 
 from foajax.config.parse import replace
 from foajax.config.schema import Config, GazeConfig, RingSensor
@@ -60,7 +60,8 @@ def over_seeds(values: Sequence[float]) -> Interval:
     mean = float(np.mean(values))
     if len(values) == 1:
         return Interval(mean, mean, mean)
-    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
+    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    half = float(special.stdtrit(len(values) - 1, (1 + CONFIDENCE) / 2) * error)
     return Interval(mean, mean - half, mean + half)
 
 

@@ -36,10 +36,16 @@ def scenes(*words: str, game: str = "search", episodes: int = EPISODES) -> searc
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(task.start))(keys))
 
 
-def play(policy, *words: str, game: str = "search", steps: int = 80, num_envs: int = 32):
-    """Returns of whole episodes, and their facts; `policy(state, t)` gives actions [B] and focal points [B, 2]."""
-    environment = make(configured(*words, game=game), num_envs=num_envs, seed=3)
+@functools.cache
+def made(config: Config) -> jax_envs.JaxEnvironment:
+    environment = make(config, num_envs=32, seed=3)
     assert isinstance(environment, jax_envs.JaxEnvironment)
+    return environment
+
+
+def play(policy, *words: str, game: str = "search", steps: int = 80):
+    """Returns of whole episodes, and their facts; `policy(state, t)` gives actions [B] and focal points [B, 2]."""
+    environment, num_envs = made(configured(*words, game=game)), 32
     environment.reset()
     total, returns, tables = np.zeros(num_envs), [], []
     for t in range(steps):
@@ -367,11 +373,10 @@ def test_a_saved_environment_goes_on_bit_for_bit():
 
 
 def test_who_is_told_no_focal_point_looks_at_the_centre():
-    environment = make(configured(), num_envs=32, seed=0)  # as many as `play` has: the same program
+    environment = made(configured())
     environment.reset()
     environment.send(np.zeros(32, np.int32))
     environment.recv()
-    assert isinstance(environment, jax_envs.JaxEnvironment)
     np.testing.assert_array_equal(environment.get_state().task.point, np.full((32, 2), 80))
 
 

@@ -167,13 +167,8 @@ def lose_one(tmp_path, number, *, which):
     return left.returncode, [line for line in err.splitlines() if line.startswith("foajax: error: ")]
 
 
-HANGS = pytest.param(1, signal.SIGSTOP, marks=pytest.mark.slow)
-
-
-LOST = pytest.param(1, signal.SIGKILL, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(("which", "number"), [LOST, (0, signal.SIGKILL), HANGS])
+@pytest.mark.slow
+@pytest.mark.parametrize(("which", "number"), [(1, signal.SIGKILL), (0, signal.SIGKILL), (1, signal.SIGSTOP)])
 def test_a_process_that_is_lost_ends_the_others_with_a_checkpoint(tmp_path, which, number):
     """Process 0 as well, which has the run's directory and starts JAX's coordination service."""
     code, lines = lose_one(tmp_path, number, which=which)

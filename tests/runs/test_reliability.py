@@ -65,19 +65,19 @@ def test_a_damaged_newest_and_foreign_files_cost_one_checkpoint(run):
     assert newest(run) == 12400 and not (run / "sprung").exists()
 
 
-def test_no_usable_checkpoint_is_one_line_and_starts_nothing(run):
+def test_no_usable_checkpoint_is_one_line_and_starts_nothing(run, command):
     for path in (run / "checkpoints").iterdir():
         (path / "SHA256SUMS").unlink()
     before = sorted((run / "checkpoints").rglob("*"))
-    code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=20000")
+    code, out, err = command(*SEEK, f"run={run}", "train.env_steps=20000")
     assert code == 2 and len(err.splitlines()) == 1 and "no usable checkpoint in" in err
     assert sorted((run / "checkpoints").rglob("*")) == before
 
 
 @pytest.mark.parametrize("name", ["agent.json", pytest.param("metrics.jsonl", marks=pytest.mark.slow)])
-def test_a_file_that_cannot_be_written_at_the_start_is_one_line(tmp_path, name):
+def test_a_file_that_cannot_be_written_at_the_start_is_one_line(tmp_path, command, name):
     (tmp_path / name).mkdir()
-    code, out, err = finish(*SEEK, f"run={tmp_path}")
+    code, out, err = command(*SEEK, f"run={tmp_path}")
     assert code == 2 and out == "" and len(err.splitlines()) == 1
     assert err.startswith(f"foajax: error: run={tmp_path}: cannot be used (") and name in err
 
