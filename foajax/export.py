@@ -28,7 +28,7 @@ class Options(Section):
         "newest", description="Of a run: the latest, or that with the best score in training."
     )
     dtype: Literal["float32", "float16", "int8"] = Field(
-        "float32", description="Of the weights; float16 halves the file, int8 is faster and less exact."
+        "float32", description="Of the weights; float16 halves the file, int8 thirds it and is less exact."
     )
     stablehlo: bool = Field(False, description="Whether the whole decision is written as a program for JAX too.")
     trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
