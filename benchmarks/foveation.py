@@ -20,11 +20,9 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from pydantic import Field
 
 from foajax import cli, runtime
 from foajax.config.compose import compose
-from foajax.config.parse import Section
 from foajax.config.schema import LogPolarSensor, RingSensor, SensorConfig
 from foajax.reporting import bench
 from foajax.sensors.sense import sense
@@ -117,18 +115,9 @@ def against_opencv() -> dict[str, float] | None:
     return {"foajax": sensed, "opencv": looped, "speedup": looped / sensed}
 
 
-class Options(Section):
-    """What the command takes."""
-
-    out: str | None = Field(None, description="File for the result.")
-
-    def check(self) -> None:
-        cli.check_file("out", self.out)
-
-
 def main(arguments: Sequence[str]) -> None:
     """Runs all three and writes JSON where `out=<file>` says so."""
-    options = cli.parse(Options, arguments)
+    options = cli.parse(bench.Options, arguments)
     runtime.wait_in_place()
     results: dict[str, object] = {
         "device": jax.devices()[0].device_kind,

@@ -40,7 +40,7 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.parse import ConfigError, Section, to_mapping
+from foajax.config.parse import ConfigError, to_mapping
 from foajax.envs.make import make
 from foajax.reporting import bench
 
@@ -49,7 +49,7 @@ DEVICES = (2, 4, 8)
 MINIBATCHES = 4
 
 
-class Options(Section):
+class Options(bench.Options):
     """What the command takes."""
 
     part: Literal["all", "weak", "allreduce", "model", "member"] = Field(
@@ -59,13 +59,9 @@ class Options(Section):
     experiment: str = Field("constant70_packed", description="The experiment.")
     envs: int = Field(16, ge=1, multiple_of=MINIBATCHES, description="Environments of each process.")
     seconds: float = Field(20.0, description="Seconds that a speed is measured over.")
-    out: str | None = Field(None, description="File for the result.")
     devices: int = Field(1, description="For part=member: how many processes there are.")
     coordinator: str = Field("", description="For part=member: address of the first one.")
     process: int = Field(0, description="For part=member: number of this one.")
-
-    def check(self) -> None:
-        cli.check_file("out", self.out)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,19 +15,15 @@ from pydantic import Field
 
 from foajax import cli, runtime
 from foajax.config.compose import compose
-from foajax.config.parse import Section, replace
+from foajax.config.parse import replace
 from foajax.reporting import bench, cost, search
 
 
-class Options(Section):
+class Options(bench.Options):
     """What the command takes."""
 
     decisions: float = Field(8, gt=0, description="Decisions until the answer.")
     repeats: int = Field(200, ge=1, description="Repeats of each timing.")
-    out: str | None = Field(None, description="File for the result.")
-
-    def check(self) -> None:
-        cli.check_file("out", self.out)
 
 
 def main(arguments: Sequence[str]) -> None:

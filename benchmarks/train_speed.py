@@ -33,7 +33,6 @@ from rich.table import Table
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.parse import Section
 from foajax.config.schema import Config
 from foajax.envs.make import make_environments
 from foajax.learning.agent import Agent
@@ -45,7 +44,7 @@ from foajax.training.collector import Collector, update_on
 PARTS = ("env_only", "act_only", "update_only", "end_to_end")
 
 
-class Options(Section):
+class Options(bench.Options):
     """What the command takes beside keys of the configuration."""
 
     experiments: str = Field(
@@ -58,10 +57,6 @@ class Options(Section):
     repeats: int = Field(5, ge=1, description="Turns of each part.")
     seconds: float = Field(3.0, gt=0, description="Seconds per turn of one part.")
     startup: bool = Field(True, description="Also time a whole process up to its first update.")
-    out: str | None = Field(None, description="File for the result.")
-
-    def check(self) -> None:
-        cli.check_file("out", self.out)
 
 
 class Bench:

@@ -27,7 +27,6 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.compose import compose
-from foajax.config.parse import Section
 from foajax.config.schema import Config, NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.learning.optimizer import make_optimizer
@@ -40,17 +39,13 @@ ACTIONS = 4
 PARTS = ("forward", "forward_backward", "update", "update_fused")
 
 
-class Options(Section):
+class Options(bench.Options):
     """What the command takes."""
 
     experiments: str = Field("nonfoa,constant70_packed", description="Names with commas between them.")
     torso: str = Field("nature", description="Choice of the group network/.")
     num_envs: int = Field(4, ge=1, description="Environments of a minibatch.")
     repeats: int = Field(40, ge=5, description="Repeats of each timing.")
-    out: str | None = Field(None, description="File for the result.")
-
-    def check(self) -> None:
-        cli.check_file("out", self.out)
 
 
 def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]:

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from foajax import cli
 from foajax.config import shipped
+from foajax.config.parse import Section
 from foajax.reporting.markdown import table
 from foajax.runs.provenance import commit, machine
 
@@ -18,6 +21,16 @@ BENCH = shipped.kept_runs().parent / "bench"
 _INTRO = """# Measurements
 Each file has its command, commit, machine and date, and under `results` what the command found. Made by `foajax keep`.
 """
+
+
+class Options(Section):
+    """What every benchmark takes."""
+
+    out: str | None = Field(None, description="File for the result.")
+
+    def check(self) -> None:
+        """`ConfigError` where the file cannot be written."""
+        cli.check_file("out", self.out)
 
 
 def write(key: str, path: str, results: Any, command: Sequence[str]) -> None:
