@@ -15,6 +15,7 @@ from foajax.config.parse import one_line, refuse
 from foajax.config.schema import RENAMED, Config
 from foajax.config.shipped import experiments
 from foajax.launch import sweep
+from foajax.launch.signals import interrupt_ends
 from foajax.runs.directory import is_run
 from foajax.runs.status import is_finished
 
@@ -51,7 +52,8 @@ def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) 
     directory, arguments = _take_directory(arguments)
     _name_new_words(arguments)
     if not any(word.startswith("-") for word in arguments):
-        return task(compose(arguments, directory))
+        with interrupt_ends():
+            return task(compose(arguments, directory))
     ours = [word for word in arguments if "=" in word and not word.startswith(("-", "hydra.", "hydra/"))]
     runs = sweep.expand(ours, directory)
     rest = [word for word in arguments if word not in ours]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
+from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
@@ -19,6 +21,24 @@ def signal_in(numbers: bytes) -> str:
 def arrive_here() -> bool:
     """Whether this is the main thread, the only one that Python lets handle signals."""
     return threading.current_thread() is threading.main_thread()
+
+
+@contextlib.contextmanager
+def interrupt_ends() -> Iterator[None]:
+    """SIGINT ends the process outright, as SIGTERM does, until a `StopRequest` takes it over.
+
+    Python raises KeyboardInterrupt instead, which is lost where it comes inside a callback, such as JAX's at a garbage
+    collection. A handler of one's own, and a SIGINT that is ignored, stay.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if not arrive_here() or before is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class StopRequest:

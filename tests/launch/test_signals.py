@@ -4,12 +4,32 @@ from __future__ import annotations
 
 import random
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
 from processes import TINY, newest, start
 
 from foajax.runs.agents import load_agent
+
+IN_A_CALLBACK = """
+import gc, os, signal
+from foajax.launch import launch
+
+def task(config):
+    gc.callbacks.append(lambda phase, info: os.kill(os.getpid(), signal.SIGINT))
+    gc.collect()
+    print("went on", flush=True)
+
+launch.run(task, ["game=seek"])
+"""
+
+
+def test_an_interrupt_inside_a_callback_is_heard():
+    """Where Python would print a KeyboardInterrupt, forget it and go on."""
+    process = subprocess.run([sys.executable, "-c", IN_A_CALLBACK], capture_output=True, text=True, timeout=60)
+    assert (process.returncode, process.stdout) == (-signal.SIGINT, "")
 
 
 @pytest.mark.slow
