@@ -3,7 +3,8 @@
     python ppo_jax.py --game pong --sensor constant70_packed --steps 1000000
 
 The environments are ale-py's, the sensor and the gaze foajax's, everything else is here. Both actions are parts of one
-policy: its log-probability is the sum of theirs, and one value serves both.
+policy: its log-probability is the sum of theirs, and one value serves both. The network has no memory, so it is shown
+the last four frames.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def update(params, state, batch, optimizer):
 def train(game="pong", sensor="constant70_packed", steps=1_000_000, num_envs=8, seed=0, report=print):
     """Trained parameters, and the returns of all episodes."""
     env = foajax.FoveatedVectorObservation(
-        AtariVectorEnv(game, num_envs, stack_num=1), sensor, dtype=np.uint8, actions="multidiscrete"
+        AtariVectorEnv(game, num_envs, stack_num=4), sensor, dtype=np.uint8, actions="multidiscrete"
     )
     key, random = jax.random.key(seed), np.random.default_rng(seed)
     shape = env.single_observation_space["image"].shape

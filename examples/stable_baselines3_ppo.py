@@ -27,9 +27,10 @@ gymnasium.register_envs(ale_py)
 
 
 def make(game: str, sensor: str) -> gymnasium.Env:
-    """An Atari game, four frames a decision and clipped rewards, through a sensor."""
+    """An Atari game, the last four frames of it and clipped rewards, through a sensor."""
     env = gymnasium.make(game, frameskip=1, repeat_action_probability=0.0)
     env = gymnasium.wrappers.AtariPreprocessing(env, frame_skip=4)
+    env = gymnasium.wrappers.FrameStackObservation(env, 4)  # PPO has no memory
     env = gymnasium.wrappers.TransformReward(env, np.sign)
     return foajax.FoveatedObservation(env, sensor, dtype=np.uint8, actions="multidiscrete")
 
