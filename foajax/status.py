@@ -38,7 +38,7 @@ def table(runs: Sequence[RunStatus]) -> Table:
     drawn = Table(title=f"{len(runs)} runs: {', '.join(counts)}" if runs else "no runs yet")
     drawn.add_column("run", overflow="fold")
     drawn.add_column("state", overflow="fold")
-    for column in ("env_steps", "of", "steps/s", "return", "left"):
+    for column in ("env_steps", "of", "steps/s", "score", "left"):
         drawn.add_column(column, justify="right")
     for run in runs:
         left = run.seconds_left

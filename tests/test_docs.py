@@ -42,7 +42,9 @@ def test_there_are_blocks_and_values():
 def commands():
     """Every command line of the guide, without its comment."""
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
-        for block in re.findall(r"```(?:sh)?\n(.*?)```", page.read_text(), re.DOTALL):
+        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+            if language not in ("", "sh"):
+                continue
             for line in block.replace("\\\n", " ").splitlines():
                 found = re.match(r"(?:foajax |python -m foajax\.)([a-z]+)(?: ([^#]*))?", line)
                 if found and not re.search(r"\.\.\.|<", line):

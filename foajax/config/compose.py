@@ -160,5 +160,6 @@ def choices(config_dir: str | Path | None = None) -> dict[str, tuple[str, ...]]:
     found: dict[str, set[str]] = {"sensor": {*_KINDS, *_packed()}, "experiment": {*_rings(), *_packed()}}
     for directory in [experiments()] + ([] if config_dir is None else [Path(config_dir)]):
         for file in directory.glob("*/*.yaml"):
-            found.setdefault(file.parent.name, set()).add(file.stem)
+            if file.parent.name != "plans":  # those are no group: `foajax reproduce` reads them
+                found.setdefault(file.parent.name, set()).add(file.stem)
     return {group: tuple(sorted(names)) for group, names in sorted(found.items())}

@@ -36,25 +36,34 @@ Ring = Annotated[tuple[int, int, int], _says("[height, width, factor] with 1 <= 
 Grid = Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], _says("[rows, columns] >= 1")]
 Side = Annotated[int, Field(ge=8, le=10_000)]
 Shape = Annotated[tuple[Side, Side], _says("[height, width], each from 8 to 10000")]
-Letters = Annotated[int, Field(ge=1, le=1000)]
+Steps = Annotated[int | tuple[int, ...], _says("an integer from 1 to 10000, or a rising list of them")]
+Letters = Annotated[
+    tuple[Annotated[int, Field(ge=1, le=1000)], ...], _says("a list of one or more integers from 1 to 1000")
+]
 Width = Annotated[int, Field(ge=1, le=16_384)]
+Widths = Annotated[tuple[Width, ...], _says("a list of one or more integers from 1 to 16384")]
+Contrast = Annotated[tuple[float, float], _says("[least, most] in (0, 1]")]
 Row = Annotated[int, Field(ge=0, le=50), _says("a screen row from 0 to 50 (160 rows are kept of 210)")]
 Name = Annotated[str, Field(pattern=r"\S"), _says("a name")]
 
 
 class RingSensor(Section):
-    """A focal area of nested rings; non-FoA, Constant, Decreasing and their (P) forms (Table II)."""
+    """Windows nested around the focal point, called rings, each with its own resolution: the paper's Table II."""
 
     prefix: ClassVar[str] = "sensor."
     size_key: ClassVar[str] = "sensor.rings"  # what decides how large the focal area is
     may_overhang: ClassVar[bool] = False  # whether the area may be larger than the frame where gaze.bounds=point
-    rings: tuple[Ring, ...] = Field(min_length=1, description="Rings, inner to outer, with their subsampling factors.")
-    kind: Literal["rings"] = Field("rings", description="Nested rings.")
-    peripheral: Grid | None = Field(None, description="Grid of the coarse background; null for none.")
-    layout: Literal["canvas", "packed"] = Field(
-        "canvas", description="Whether the values stand at their place in a frame, or alone, without the canvas."
+    rings: tuple[Ring, ...] = Field(
+        min_length=1, description="Rings, innermost first; each shows one value per block of factor x factor pixels."
     )
-    pooling: Literal["mean", "stride"] = Field("mean", description="What stands for a block of pixels: mean or corner.")
+    kind: Literal["rings"] = Field("rings", description="Selects nested rings.")
+    peripheral: Grid | None = Field(None, description="Background: a coarse grid over the whole frame; null for none.")
+    layout: Literal["canvas", "packed"] = Field(
+        "canvas", description="One image of the frame's size, 0 where nothing is seen, or a small image per ring."
+    )
+    pooling: Literal["mean", "stride"] = Field(
+        "mean", description="Value of a block: the mean of its pixels, or its upper left pixel (stride)."
+    )
 
     def check(self) -> None:
         for height, width, factor in self.rings:
@@ -77,17 +86,19 @@ class RingSensor(Section):
 
 
 class LogPolarSensor(Section):
-    """A log-polar retina: rings x wedges around the focal point, radii growing geometrically."""
+    """A log-polar retina: rings of wedges around the focal point, larger the farther out."""
 
     prefix: ClassVar[str] = "sensor."
     size_key: ClassVar[str] = "sensor.radius"
     may_overhang: ClassVar[bool] = True
-    kind: Literal["logpolar"] = Field("logpolar", description="A log-polar retina.")
-    rings: int = Field(35, ge=2, le=1000, description="How many rings there are.")
-    wedges: int = Field(35, ge=4, le=1000, description="How many values each ring has.")
+    kind: Literal["logpolar"] = Field("logpolar", description="Selects the log-polar retina.")
+    rings: int = Field(35, ge=2, le=1000, description="Number of rings.")
+    wedges: int = Field(35, ge=4, le=1000, description="Number of wedges per ring, one value each.")
     fovea: float = Field(3.0, gt=0, description="Radius of the innermost ring, a disc, in frame pixels.")
-    radius: float = Field(40.0, gt=0, le=10_000, description="Outer radius in frame pixels.")
-    sampling: Literal["area", "bilinear"] = Field("area", description="A value is the mean of its area, or one sample.")
+    radius: float = Field(40.0, gt=0, le=10_000, description="Radius of the outermost ring, in frame pixels.")
+    sampling: Literal["area", "bilinear"] = Field(
+        "area", description="Value of a wedge: the mean of its area, or one sample at its centre (bilinear)."
+    )
 
     def check(self) -> None:
         if self.fovea >= self.radius:
@@ -107,15 +118,15 @@ class LogPolarSensor(Section):
 
 
 class OwnSensor(Section):
-    """A sensor from elsewhere; see `foajax.sensors.base.Sensor`. It is made, and checked, where it is first used."""
+    """A class of your own that is a `foajax.Sensor`, chosen by `sensor=own`. It is checked when it is first used."""
 
     prefix: ClassVar[str] = "sensor."
     size_key: ClassVar[str] = "sensor.kwargs"
     may_overhang: ClassVar[bool] = True
     window: ClassVar[None] = None  # not known before it is made
     finest: ClassVar[None] = None
-    kind: str = Field(description="Its class, package.module:Class.")
-    kwargs: Mapping[str, Any] = Field({}, description="Arguments of its constructor.")
+    kind: str = Field(description="The sensor's class, package.module:Class.")
+    kwargs: Mapping[str, Any] = Field({}, description="Arguments of the sensor's constructor.")
 
 
 SensorConfig = RingSensor | LogPolarSensor | OwnSensor
@@ -132,26 +143,30 @@ class GazeConfig(Section):
 
     prefix: ClassVar[str] = "gaze."
     mode: Literal["none", "learned", "frozen", "random", "scripted"] = Field(
-        "learned", description="What moves the focal point; none for a sensor that shows the whole frame."
+        "learned", description="What moves the gaze: the network, nothing, chance, gaze.path; none is for whole frames."
     )
     actions: Literal[5, 9] = Field(
-        5, description="Directions of steps: stay, up, down, left, right; 9 adds the diagonals."
+        5, description="Directions of a step: stay, up, down, left, right; 9 adds the diagonals."
     )
-    step: int | tuple[int, ...] = Field(
-        4, description="Frame pixels of a step; several sizes, rising, give an action each per direction."
-    )
+    step: Steps = Field(4, description="Frame pixels of a step; a list gives each direction one action per length.")
     bounds: Literal["window", "fovea", "point"] = Field(
-        "window", description="What has to stay inside the frame: the whole area, its finest part, or the point alone."
+        "window", description="What stays in the frame: the sensor's window, its finest part, or the focal point."
     )
-    start: Literal["centre", "random"] | Point = Field("centre", description="Start of an episode, moved in bounds.")
-    path: tuple[Point, ...] = Field((), description="Points that mode=scripted visits in turn, moved in bounds.")
+    start: Literal["centre", "random"] | Point = Field(
+        "centre", description="Focal point at an episode's start, within gaze.bounds."
+    )
+    path: tuple[Point, ...] = Field(
+        (), description="Focal points that mode=scripted visits in turn, within gaze.bounds."
+    )
     moves: Literal["steps", "absolute"] = Field(
-        "steps", description="What a visual action is: a step, or a cell of a grid to look at."
+        "steps", description="What a visual action is: a step, or a cell of gaze.grid to look at (absolute)."
     )
-    grid: Grid = Field((5, 5), description="Cells that an absolute move chooses from.")
-    cost: float = Field(0.0, ge=0, description="Price of a saccade, taken from the reward that is learned from.")
+    grid: Grid = Field((5, 5), description="Grid over the frame whose cells gaze.moves=absolute chooses from.")
+    cost: float = Field(
+        0.0, ge=0, description="Price of moving the gaze; lowers the reward to learn from, not the score."
+    )
     cost_per: Literal["pixel", "saccade"] = Field(
-        "pixel", description="What is counted: frame pixels moved, or saccades of any length."
+        "pixel", description="What the price is per: a frame pixel moved, or a move of any length (saccade)."
     )
 
     def check(self) -> None:
@@ -188,32 +203,42 @@ class GazeConfig(Section):
 
 
 class EnvConfig(Section):
-    """The environment and its preprocessing (Table III)."""
+    """The environment, and how its frames and rewards are preprocessed."""
 
     prefix: ClassVar[str] = "env."
-    engine: Literal["envpool", "ale"] = Field("envpool", description="What runs Atari games.")
-    num_envs: int = Field(32, ge=1, le=100_000, description="Environments, of all processes together.")
-    num_groups: int = Field(1, ge=1, description="Sets of environments that step in turn, while another decides.")
-    frame_shape: Shape = Field((80, 80), description="Size of the frame that the sensor looks at.")
+    engine: Literal["envpool", "ale"] = Field("envpool", description="What runs Atari games: EnvPool or ale-py.")
+    num_envs: int = Field(32, ge=1, le=100_000, description="Environments that run at the same time, in all processes.")
+    num_groups: int = Field(
+        1, ge=1, description="Groups of environments; while one steps, the network decides for another."
+    )
+    frame_shape: Shape = Field((80, 80), description="Size in pixels of the frame that the sensor looks at.")
     crop: bool = Field(
-        True, description="Halve 160 of an Atari screen's 210 rows; else shrink the whole screen to env.frame_shape."
+        True, description="Keep 160 of Atari's 210 rows and halve both sides; else shrink all to env.frame_shape."
     )
-    crop_top: Mapping[str, Row] = Field({"default": 34, "beam_rider": 20}, description="First screen row, by game.")
-    color: bool = Field(False, description="Frames in colour, of Atari and Gymnasium games; else gray.")
-    full_action_space: bool = Field(
-        False, description="All 18 actions of an Atari game, not just those that do anything."
+    crop_top: Mapping[str, Row] = Field(
+        {"default": 34, "beam_rider": 20}, description="First row that env.crop keeps, by game."
     )
-    frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per step.")
-    noop_max: int = Field(30, ge=0, le=200, description="No-ops before an episode are drawn from 0 to this.")
-    clip_rewards: bool = Field(True, description="Clip rewards to [-1, 1] for learning.")
-    episodic_life: bool = Field(True, description="A lost life ends the learner's episode.")
-    fire_on_reset: bool = Field(True, description="Press FIRE where a game waits for it.")
-    sticky_actions: float = Field(0.0, ge=0, lt=1, description="Probability that the emulator repeats the last action.")
+    color: bool = Field(False, description="Frames in colour, for Atari and Gymnasium environments; else gray.")
+    full_action_space: bool = Field(False, description="All 18 actions of Atari; else those that have an effect.")
+    frame_skip: int = Field(4, ge=1, le=1000, description="Emulator frames per decision; the action is held.")
+    noop_max: int = Field(
+        30, ge=0, le=200, description="Most no-op actions at an episode's start; drawn from 0 to this."
+    )
+    clip_rewards: bool = Field(
+        True, description="Learn from the sign of rewards in Atari and Gymnasium environments; scores stay unclipped."
+    )
+    episodic_life: bool = Field(True, description="A lost life ends the episode for learning; the game goes on.")
+    fire_on_reset: bool = Field(
+        True, description="Press FIRE at the start and after a lost life, in games that have it."
+    )
+    sticky_actions: float = Field(
+        0.0, ge=0, lt=1, description="Probability that the emulator repeats the action before."
+    )
     # The engines count frames in 32 bits, and abort the process where the system has no threads left.
-    max_episode_steps: int = Field(27_000, ge=1, le=2_000_000, description="Agent steps after which a game is cut.")
-    threads: int = Field(0, ge=0, le=1024, description="Threads of the engine; 0 lets it choose.")
-    timeout: float = Field(120.0, gt=0, description="Seconds per step after which the engine is taken for hung.")
-    kwargs: Mapping[str, Any] = Field({}, description="Arguments of a Gymnasium environment or of one's own factory.")
+    max_episode_steps: int = Field(27_000, ge=1, le=2_000_000, description="Decisions after which a game is cut short.")
+    threads: int = Field(0, ge=0, le=1024, description="Threads of env.engine; 0 lets it choose.")
+    timeout: float = Field(120.0, gt=0, description="Seconds that a step may take; then the run saves and ends.")
+    kwargs: Mapping[str, Any] = Field({}, description="Arguments of a Gymnasium environment or of your own factory.")
 
     def check(self) -> None:
         if "default" not in self.crop_top:
@@ -226,27 +251,30 @@ class EnvConfig(Section):
 
 
 class SearchConfig(Section):
-    """The scenes of game=search and game=detect."""
+    """The scenes of game=search and game=detect: letters, of which one is the target."""
 
     prefix: ClassVar[str] = "search."
     target: Literal["letter", "feature", "conjunction", "cued"] = Field(
-        "letter", description="What tells the target: its letter, its brightness, both, or a cue shown first."
+        "letter", description="What marks the target: its letter, its brightness, both, or a letter shown first (cued)."
     )
-    set_sizes: tuple[Letters, ...] = Field((8,), min_length=1, description="Letters in a scene, drawn from these.")
+    set_sizes: Letters = Field((8,), min_length=1, description="Numbers of letters; each scene has one of them.")
     staircase: bool = Field(
-        False, description="Train on scenes with several targets first, one fewer per right answer, two more per wrong."
+        False,
+        description="Begin with many targets per scene: one fewer after a right answer, two more after a wrong one.",
     )
-    absent: bool = Field(False, description="Half of the scenes have no target, and one more answer says so.")
-    classes: Literal[2, 4] = Field(4, description="Ways that the target may point, and answers.")
+    absent: bool = Field(
+        False, description="Half of the scenes have no target; their right answer is the action absent."
+    )
+    classes: Literal[2, 4] = Field(
+        4, description="Directions that the target may point in, an answer each: left, right; 4 adds up, down."
+    )
     max_fixations: int = Field(
-        30, ge=1, le=10_000, description="Decisions after which an episode ends as with a wrong answer."
+        30, ge=1, le=10_000, description="Decisions until an episode ends; no answer counts as a wrong one."
     )
-    price: float = Field(0.01, ge=0, lt=1, description="Price of a decision, in units of reward.")
-    contrast: tuple[float, float] = Field(
-        (0.6, 1.0), description="Contrast of letters on their plates, drawn between these."
-    )
-    noise: float = Field(0.0, ge=0, le=64, description="Standard deviation of noise, gray levels.")
-    clutter: int = Field(0, ge=0, le=1000, description="Bars between the letters.")
+    price: float = Field(0.01, ge=0, lt=1, description="Price of a decision, subtracted from the reward.")
+    contrast: Contrast = Field((0.6, 1.0), description="Range of the letters' contrast with their plates.")
+    noise: float = Field(0.0, ge=0, le=64, description="Standard deviation of the noise in each pixel, in gray levels.")
+    clutter: int = Field(0, ge=0, le=1000, description="Bars between the letters, as distractors.")
 
     def check(self) -> None:
         if not 0 < self.contrast[0] <= self.contrast[1] <= 1:
@@ -257,34 +285,39 @@ class NetworkConfig(Section):
     """The network's parts and their sizes."""
 
     prefix: ClassVar[str] = "network."
-    torso: str = Field("nature", description="The convolutions: nature, a3c, small, impala, or package.module:Class.")
-    widths: tuple[Width, ...] | None = Field(
-        None, min_length=1, description="Channels of the torso's layers; null for its own."
+    torso: str = Field(
+        "nature",
+        description="Convolutions for the sensor's images: nature, a3c, small, impala, or package.module:Class.",
     )
-    torso_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the torso.")
-    core: str = Field("lstm", description="The memory: lstm, gru, mingru, none (no memory), or package.module:Class.")
-    core_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the core.")
-    dense: int = Field(256, ge=0, le=16_384, description="Units between torso and LSTM; 0 for none.")
-    dense_norm: bool = Field(True, description="Layer norm of what enters these units.")
-    lstm: int = Field(256, ge=1, le=16_384, description="Units of the LSTM.")
+    widths: Widths | None = Field(
+        None, min_length=1, description="Channels of the torso's layers; null for its defaults."
+    )
+    torso_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the torso's constructor.")
+    core: str = Field("lstm", description="Memory before the heads: lstm, gru, mingru, none, or package.module:Class.")
+    core_kwargs: Mapping[str, Any] = Field({}, description="Further arguments of the core's constructor.")
+    dense: int = Field(256, ge=0, le=16_384, description="Units of the layer between torso and core; 0 for no layer.")
+    dense_norm: bool = Field(True, description="Apply layer norm to the inputs of the dense layer.")
+    lstm: int = Field(256, ge=1, le=16_384, description="Units of the core, whichever network.core is.")
     padding: Literal["cover", "valid"] = Field(
-        "cover", description="Whether the nature torso sees what its strides would leave out (cover) or not (valid)."
+        "cover", description="Rows and columns that the nature torso's strides leave over: seen (cover) or dropped."
     )
     focal_point: Literal["always", "packed"] = Field(
-        "always", description="When the LSTM is told the focal point: always, or where no canvas shows it (packed)."
+        "always", description="When the core is told the focal point: always, or where there is no canvas (packed)."
     )
     focal_scale: Literal["reach", "frame"] = Field(
-        "reach", description="What lies at -1 and 1 of that point: the ends of its reach, or of the frame."
+        "reach", description="The core is told the focal point as -1 to 1 over the gaze's reach, or over the frame."
     )
-    last_actions: bool = Field(True, description="The LSTM is told both actions of the step before.")
-    last_reward: bool = Field(True, description="The LSTM is told the reward of the step before.")
-    forget_bias: float = Field(1.0, ge=-100, le=100, description="Of the LSTM's forget gates, before learning.")
-    lstm_norm: bool = Field(True, description="Layer norm of the input's part of the LSTM's gates.")
+    last_actions: bool = Field(True, description="Tell the core the natural and the visual action of the last step.")
+    last_reward: bool = Field(True, description="Tell the core the reward of the last step.")
+    forget_bias: float = Field(
+        1.0, ge=-100, le=100, description="Initial bias of the forget gates; more keeps memory longer."
+    )
+    lstm_norm: bool = Field(True, description="Apply layer norm to what the core's gates get from its inputs.")
     priority_map: bool = Field(
-        False, description="The vision head reads the peripheral grid as a map of where to look."
+        False, description="Look the likelier at a cell of the background the better it matches a query from the core."
     )
     normalization: Literal["pixel", "running", "frame", "none"] = Field(
-        "pixel", description="Frames less a mean: of each pixel, of all pixels so far, of one frame, or none."
+        "pixel", description="Mean subtracted from frames: running per pixel, running over all, or each frame's own."
     )
 
     def check(self) -> None:
@@ -296,45 +329,63 @@ class NetworkConfig(Section):
 class HeadConfig(Section):
     """What one head learns with."""
 
-    gamma: float = Field(0.99, ge=0, le=1, description="Discount per step.")
-    gae_lambda: float = Field(0.95, ge=0, le=1, description="Lambda of the generalised advantages.")
-    entropy_weight: float = Field(0.003, ge=0, description="Weight of the policy's entropy.")
+    gamma: float = Field(0.99, ge=0, le=1, description="Discount per decision.")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="Lambda of generalised advantage estimation (GAE).")
+    entropy_weight: float = Field(0.003, ge=0, description="Weight of the entropy, a bonus for exploring.")
 
 
 class LearnerConfig(Section):
-    """The update."""
+    """How the network learns from a rollout: losses, optimizer and schedule."""
 
     prefix: ClassVar[str] = "learner."
-    rollout_length: int = Field(64, ge=2, le=100_000, description="Steps per environment between two updates, T.")
-    num_minibatches: int = Field(16, ge=1, le=100_000, description="Groups of environments, each with a gradient step.")
-    num_epochs: int = Field(2, ge=1, le=1000, description="Passes over a rollout.")
-    clip_ratio: float | None = Field(0.1, gt=0, description="PPO's clipping of probability ratios; null for plain A2C.")
-    learning_rate: float = Field(1e-3, gt=0, description="Adam's, after the warm-up.")
+    rollout_length: int = Field(
+        64, ge=2, le=100_000, description="Decisions per environment between two updates of the network, T."
+    )
+    num_minibatches: int = Field(
+        16, ge=1, le=100_000, description="Gradient steps per pass, each on a share of the environments."
+    )
+    num_epochs: int = Field(2, ge=1, le=1000, description="Passes over each rollout.")
+    clip_ratio: float | None = Field(
+        0.1, gt=0, description="PPO's bound on how far probability ratios leave 1; null for none, as in A2C."
+    )
+    learning_rate: float = Field(1e-3, gt=0, description="Adam's learning rate after the warm-up.")
     full_rate_inputs: int | None = Field(
-        None, ge=1, le=10**9, description="Layers with more inputs learn at a rate that much smaller; null for none."
+        None,
+        ge=1,
+        le=10**9,
+        description="Layers with n times this many inputs learn at 1/n of the rate; null for one rate.",
     )
-    warmup_updates: int = Field(1000, ge=0, le=10**9, description="Updates over which the rate rises; 0 for none.")
+    warmup_updates: int = Field(
+        1000, ge=0, le=10**9, description="Updates until the full learning rate; 0 for no warm-up."
+    )
     schedule: Literal["constant", "linear"] = Field(
-        "linear", description="The rate after that; linear falls to 0 at train.env_steps, skipped updates apart."
+        "linear", description="Learning rate: constant, or falling linearly to 0 at train.env_steps."
     )
-    amsgrad: bool = Field(False, description="Divide by the largest second moment so far, in place of Adam's latest.")
-    adam_b1: float = Field(0.9, ge=0, lt=1, description="Decay of Adam's first moment.")
-    adam_b2: float = Field(0.999, ge=0, lt=1, description="Decay of Adam's second moment.")
-    adam_eps: float = Field(1e-5, gt=0, description="Added to the root of the second moment.")
-    max_grad_norm: float | None = Field(0.5, gt=0, description="Largest norm of the whole gradient; null for no limit.")
-    reduction: Literal["mean", "sum"] = Field("mean", description="Of losses over time; else it is the mean.")
-    normalize_advantages: bool = Field(True, description="Advantages of a minibatch get mean 0 and deviation 1.")
-    value_weight: float = Field(0.5, ge=0, description="Weight of both value losses.")
-    vision_weight: float = Field(0.25, ge=0, description="Weight of both of the vision head's losses.")
-    value_target: Literal["n_step", "lambda"] = Field("lambda", description="N-step or lambda-returns.")
+    amsgrad: bool = Field(False, description="Use AMSGrad: divide by the largest second moment so far.")
+    adam_b1: float = Field(0.9, ge=0, lt=1, description="Decay rate of Adam's first moment.")
+    adam_b2: float = Field(0.999, ge=0, lt=1, description="Decay rate of Adam's second moment.")
+    adam_eps: float = Field(1e-5, gt=0, description="Added to the root of Adam's second moment.")
+    max_grad_norm: float | None = Field(
+        0.5, gt=0, description="Norm that the whole gradient is cut down to; null for no limit."
+    )
+    reduction: Literal["mean", "sum"] = Field("mean", description="Losses over time: their mean or their sum.")
+    normalize_advantages: bool = Field(True, description="Scale each minibatch's advantages to mean 0, deviation 1.")
+    value_weight: float = Field(0.5, ge=0, description="Weight of each head's value loss.")
+    vision_weight: float = Field(
+        0.25, ge=0, description="Weight of the vision head's whole loss, beside 1 of the natural head's."
+    )
+    value_target: Literal["n_step", "lambda"] = Field("lambda", description="Values learn n-step or lambda-returns.")
     vision_bootstrap: Literal["consistent", "literal"] = Field(
-        "consistent", description="Bootstrap of the vision head's n-step returns: consistent, or literal as printed."
+        "consistent",
+        description="Vision head's n-step returns: as the paper's TD error implies, or as its formula says.",
     )
-    credits_last_gaze: bool = Field(True, description="The visual action before an end gets a policy gradient too.")
+    credits_last_gaze: bool = Field(
+        True, description="An episode's last visual action gets a gradient, though no frame follows it."
+    )
     natural: HeadConfig = Field(HeadConfig(), description="The head that acts in the environment.")
     vision: HeadConfig = Field(
         HeadConfig(),
-        description="The head that moves the gaze; follows the natural head until it is set.",
+        description="The head that moves the gaze. Its keys follow the natural head's unless you set them.",
         json_schema_extra={"follows": "learner.natural"},
     )
 
@@ -345,19 +396,27 @@ class LearnerConfig(Section):
 
 
 class TrainConfig(Section):
-    """The loop around the learner."""
+    """How long a run trains, what it starts from, and what it writes."""
 
     prefix: ClassVar[str] = "train."
-    env_steps: int = Field(5_000_000, ge=1, description="Agent steps, of all environments together, to train for.")
-    init_from: str | None = Field(None, description="Run or agent whose parameters a new run begins with.")
+    env_steps: int = Field(5_000_000, ge=1, description="Decisions, of all environments together, to train for.")
+    init_from: str | None = Field(
+        None, description="Run or agent whose parameters and frame statistics a new run begins with."
+    )
     log_every: float = Field(10.0, gt=0, description="Seconds between two rows of metrics.")
-    logger: str | None = Field(None, description="What gets each row too: wandb, or package.module:Class.")
-    logger_kwargs: Mapping[str, Any] = Field({}, description="Arguments of that logger.")
+    logger: str | None = Field(
+        None, description="Another logger of each row: wandb (Weights & Biases), or package.module:Class."
+    )
+    logger_kwargs: Mapping[str, Any] = Field({}, description="Arguments of wandb.init or of your logger.")
     checkpoint_every: float = Field(60.0, gt=0, description="Seconds between two checkpoints.")
-    keep_checkpoints: int = Field(3, ge=1, le=10**9, description="How many of the newest checkpoints are kept.")
-    devices: int = Field(1, ge=1, le=10**9, description="Devices of each process, which share its environments.")
-    max_skipped: int = Field(20, ge=1, le=10**9, description="Not finite updates in a row that stop the run.")
-    dump_skipped: bool = Field(False, description="Keep the batches that such rows begin with, in <run>/skipped.")
+    keep_checkpoints: int = Field(
+        3, ge=1, le=10**9, description="Newest checkpoints that are kept, besides the best one."
+    )
+    devices: int = Field(1, ge=1, le=10**9, description="Devices per process; they share its environments.")
+    max_skipped: int = Field(
+        20, ge=1, le=10**9, description="Stop after so many updates in a row that were not finite."
+    )
+    dump_skipped: bool = Field(False, description="Keep batches of updates that were not finite, in <run>/skipped.")
 
     def check(self) -> None:
         if self.logger is not None and self.logger != "wandb" and ":" not in self.logger:
@@ -365,13 +424,13 @@ class TrainConfig(Section):
 
 
 class DistributedConfig(Section):
-    """The processes that share a run. SLURM's are found without any of this; other launchers state the first three."""
+    """The processes that share one run. Under SLURM they find each other; elsewhere, set the first three keys."""
 
     prefix: ClassVar[str] = "distributed."
     coordinator: str | None = Field(None, description="Address of process 0, host:port.")
-    processes: int | None = Field(None, ge=1, description="How many processes share the run.")
-    process: int | None = Field(None, ge=0, description="This one's number, from 0.")
-    timeout: float = Field(180.0, gt=0, description="Seconds that others are waited for; more than env.timeout.")
+    processes: int | None = Field(None, ge=1, description="Number of processes that share the run.")
+    process: int | None = Field(None, ge=0, description="Number of this process, counted from 0.")
+    timeout: float = Field(180.0, gt=0, description="Seconds to wait for other processes; more than env.timeout.")
 
     def check(self) -> None:
         coordinator, processes, process = stated = (self.coordinator, self.processes, self.process)
@@ -386,9 +445,9 @@ class DistributedConfig(Section):
 
 
 class Config(Section):
-    """One run."""
+    """What a run trains, on what, and where its files go."""
 
-    name: Name = Field(description="Name of the experiment, such as constant70.")
+    name: Name = Field(description="Name of the experiment; experiment=constant70 sets it to constant70.")
     sensor: Annotated[
         Annotated[RingSensor, Tag("rings")]
         | Annotated[LogPolarSensor, Tag("logpolar")]
@@ -397,11 +456,15 @@ class Config(Section):
     ]
     game: Name = Field(
         "breakout",
-        description="An Atari game, seek, search, detect, probe:<name>, gymnasium:<id>, or package.module:factory.",
+        description="An Atari game, seek, search, detect, probe:<test>, gymnasium:<id>, or package.module:factory.",
     )
-    seed: int = Field(0, ge=0, le=2**31 - 10_001, description="Seed of environments, parameters and actions.")
-    run: str | None = Field(None, description="The run's directory; null for runs/<game>-<name>-s<seed>.")
-    profile: bool = Field(False, description="Trace some updates into <run>/profile in place of training.")
+    seed: int = Field(
+        0, ge=0, le=2**31 - 10_001, description="Seed of environments, first parameters and sampled actions."
+    )
+    run: str | None = Field(None, description="Directory of the run; null for runs/<game>-<name>-s<seed>.")
+    profile: bool = Field(
+        False, description="Time a few updates in place of training; print a table, write a trace to <run>/profile."
+    )
     gaze: GazeConfig = GazeConfig()
     env: EnvConfig = EnvConfig()
     search: SearchConfig = SearchConfig()

@@ -13,8 +13,12 @@ from foajax.config.parse import ABSENT, Section, describe, kinds, resolve, schem
 
 _PAGE = """# Keys
 
-Every key of a run, with its default. `python -m foajax.config.table > docs/keys.md` makes this page; the keys stand
-in `foajax/config/schema.py`. A group's choice, such as `learner=paper`, changes some of them.
+Every key of a run, with its default; *required* has none. Set a key on the command line: `foajax train gaze.step=8`.
+
+A choice of a group, such as `learner=paper` or `experiment=seek`, sets several keys at once. `foajax train --help`
+lists the choices; `foajax train experiment=seek --cfg job` prints the values of all keys.
+
+`python -m foajax.config.table > docs/keys.md` makes this page from `foajax/config/schema.py`.
 
 ## The run"""
 

@@ -385,7 +385,8 @@ def test_jobs_is_a_number_and_for_local_sweeps(cwd, runs, capsys, arguments, sai
 
 def test_help_lists_the_experiments_and_cfg_prints_the_run(cwd, runs, capsys):
     assert run(runs.record, ["--help"]) == 0
-    assert f"experiment: {', '.join(list_experiments())}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"experiment: {', '.join(list_experiments())}" in said and "plans" not in said
     assert run(runs.record, ["--cfg", "job", "seed=7"]) == 0
     assert yaml.safe_load(capsys.readouterr().out)["seed"] == 7
     assert runs == [] and list(cwd.iterdir()) == []
