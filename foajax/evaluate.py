@@ -39,10 +39,10 @@ class Options(Section):
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     episodes: int = Field(100, ge=1, description="Games to play.")
     policy: Literal["sampled", "greedy"] = Field(
-        "sampled", description="Greedy games that begin alike are alike: 31 ways with no-ops."
+        "sampled", description="How actions are chosen; greedy games differ by their no-ops at the start alone."
     )
     checkpoint: Literal["newest", "best"] = Field(
-        "newest", description="Of a run: the latest, or that with the best score in training."
+        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
     )
     json_file: str | None = Field(None, alias="json", description="File for the result.")
     num_envs: int = Field(25, ge=1, description="Games played at once.")

@@ -39,7 +39,7 @@ class Options(Section):
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str = Field(description="Directory of the agent.")
     checkpoint: Literal["newest", "best"] = Field(
-        "newest", description="Of a run: the latest, or that with the best score in training."
+        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
     )
     score: str | None = Field(None, description="File that `evaluate json=` has written, to go with the agent.")
     trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
