@@ -18,21 +18,31 @@ Params = Any  # the network's parameters, a pytree of float32 arrays
 
 
 class TimeStep(NamedTuple):
-    """What an environment shows after a step; the part that goes to the device."""
+    """What B environments show after a step; the part that goes to the device.
 
-    frame: UInt8[
-        HostArray, "B ..."
-    ]  # screen, 0..255, as the environment draws it: [B, H, W] or, in colour, [B, H, W, 3]
-    reward: Float[HostArray, "B"]  # what is learned from (clipped where asked), result of the last action
-    is_first: Bool[HostArray, "B"]  # an episode starts here: the last action was ignored, reward is 0
-    is_terminal: Bool[HostArray, "B"]  # the episode ends here and nothing follows: the value is 0
+    Attributes:
+      frame: the screens, 0..255: [B, H, W], gray, or [B, H, W, 3], RGB.
+      reward: what the last action earned, clipped if `env.clip_rewards`: the agent learns from it.
+      is_first: whether an episode begins here. The last action was ignored then, and the reward is 0.
+      is_terminal: whether the episode ends here, so that nothing follows. An episode that is cut has False.
+    """
+
+    frame: UInt8[HostArray, "B ..."]
+    reward: Float[HostArray, "B"]
+    is_first: Bool[HostArray, "B"]
+    is_terminal: Bool[HostArray, "B"]
 
 
 class Outcome(NamedTuple):
-    """The part of a step that stays on the host: whole games, as a player counts them."""
+    """The part of a step that scores are counted from; it stays on the host.
 
-    score: Float[HostArray, "B"]  # unclipped reward of this step
-    is_over: Bool[HostArray, "B"]  # the whole game ended here (a lost life is not enough)
+    Attributes:
+      score: the unclipped reward of this step.
+      is_over: whether the whole game ended here. A lost life does not end it.
+    """
+
+    score: Float[HostArray, "B"]
+    is_over: Bool[HostArray, "B"]
 
 
 class CoreState(NamedTuple):

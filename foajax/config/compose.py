@@ -35,14 +35,14 @@ _WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave o
 
 
 def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
-    """The run that `overrides` describe, e.g. `["experiment=nonfoa", "game=pong"]`, from any directory.
+    """Makes the configuration of a run, as `foajax train` does.
 
     Args:
-      overrides: words as on a command line.
-      config_dir: a directory with more choices: experiment/, sensor/, gaze/, network/, learner/.
+      overrides: words of a command line, e.g. `["experiment=nonfoa", "game=pong"]`.
+      config_dir: a directory with choices of your own, in experiment/, sensor/, gaze/, network/, learner/.
 
     Raises:
-      ConfigError: an unknown key or choice, a malformed override, or a value of the wrong type or range.
+      ConfigError: a word is not `key=value`, a key or choice is unknown, or a value has the wrong type or range.
     """
     import hydra
     from hydra.core.global_hydra import GlobalHydra

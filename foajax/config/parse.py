@@ -16,7 +16,7 @@ CODE = "package.module:Class"  # the kind of what is code from elsewhere
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be run; the message is one line for the user."""
+    """Something that the user has to correct. The message is one line: what was given, and what is accepted."""
 
 
 def refuse(

@@ -7,10 +7,7 @@ For the learner an episode ends as a terminal when the game is over or, with `en
 lost; then the game goes on in the learner's next episode. At the step limit it ends without a terminal. (A game that
 ends early among the skipped frames shows the frame before once more.)
 
-An environment of one's own is what `game=package.module:factory` calls: `factory(num_envs=, seed=, **env.kwargs)` gives
-an `Environment` of `num_envs` copies, of which copy i draws from `seed + i`. Its screens are frames of
-`env.frame_shape`, gray unless `env.color`. `foajax.envs.tasks.JaxEnvironment` makes one of a pure JAX `Task`, a
-`gymnasium:<id>` needs none.
+`docs/extending.md` shows how to write one.
 """
 
 from __future__ import annotations
@@ -24,33 +21,45 @@ from foajax.types import Outcome, TimeStep
 
 @runtime_checkable
 class Environment(Protocol):
-    """A batch of equal environments, stepped together by the host.
+    """A batch of B equal environments, which step together.
 
-    Arrays handed out are NumPy's, in the environments' order, and never written to again.
+    `game=package.module:factory` calls `factory(num_envs=, seed=, **env.kwargs)`, which returns one. Environment i of
+    the batch is seeded with `seed + i`. Frames have the size `env.frame_shape` and are gray, unless `env.color`.
+
+    The step that ends an episode returns its last frame. The step after it ignores its action and returns the first
+    frame of the next episode, with `is_first` and reward 0. Return NumPy arrays, and do not write to them
+    afterwards.
+
+    If it also has `get_state` and `set_state`, as `JaxEnvironment` has, a resumed run continues its episodes.
+
+    Attributes:
+      num_envs: B.
+      num_actions: how many natural actions there are, counted from 0.
+      crop_top: None. If frames are whole Atari screens: the first of the 160 rows that are kept.
     """
 
-    num_envs: int  # B
+    num_envs: int
     num_actions: int
-    crop_top: int | None  # first of the 160 screen rows kept; None where the screen is the frame
+    crop_top: int | None
 
     @property
     def lives(self) -> np.ndarray | None:
-        """Left in each game after the last step, int [B]; None where games have none."""
+        """The lives left in each game after the last step, int [B]; None if games have no lives."""
 
     def reset(self) -> tuple[TimeStep, Outcome]:
-        """Begins all episodes; once, before the first `send`."""
+        """Begins all episodes. It is called once, before the first `send`."""
 
     def send(self, action: np.ndarray) -> None:
         """Starts a step with the natural actions, int32 [B], and does not wait for it."""
 
     def recv(self) -> tuple[TimeStep, Outcome]:
-        """The step that `send` started, once every environment is through."""
+        """Waits for the step that `send` started, and returns it."""
 
     def render(self) -> np.ndarray:
-        """The screens in colour, uint8 [B, h, w, 3]; of an environment made with `render`."""
+        """Returns the screens in colour, uint8 [B, h, w, 3], for videos and pages."""
 
     def close(self) -> None:
-        """Ends the engine's threads."""
+        """Frees what the environments hold, such as threads."""
 
 
 def first_step(screen: np.ndarray) -> tuple[TimeStep, Outcome]:

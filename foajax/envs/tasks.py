@@ -21,18 +21,28 @@ TaskState = Any  # a pytree of arrays, the same structure throughout
 
 
 class Task(NamedTuple):
-    """The rules of one environment, as pure functions without a batch. An episode ends as a terminal."""
+    """The rules of one environment, as pure JAX functions without a batch. A state is any pytree of arrays.
+
+    Attributes:
+      num_actions: how many actions there are, counted from 0.
+      frame_shape: (H, W) of a frame.
+      start: `start(key)` returns the first state of an episode.
+      advance: `advance(state, action)` returns the next state, the reward in [-1, 1], and whether the episode ends
+        there. With `reads_gaze` it is `advance(state, action, focal_point)`.
+      draw: `draw(state)` returns the frame, uint8, gray [H, W] or RGB [H, W, 3].
+      reads_gaze: whether the rules depend on where the agent looked to decide, (y, x) in frame pixels.
+      facts: `facts(state)` returns named numbers about the episode, for measures of your own; None if there are none.
+      follow: `follow(last_state, key)` returns the first state of the episode after another, in place of `start`; None
+        if episodes do not depend on each other.
+    """
 
     num_actions: int
-    frame_shape: tuple[int, int]  # (H, W)
-    start: Callable[[Key[Array, ""]], TaskState]  # the first state of an episode
-    # What an action leads to: the next state, the reward in [-1, 1], and whether nothing follows.
-    # One that reads the gaze is told, too, at which focal point (y, x) the screen was sensed that was decided upon.
+    frame_shape: tuple[int, int]
+    start: Callable[[Key[Array, ""]], TaskState]
     advance: Callable[..., tuple[TaskState, Float[Array, ""], Bool[Array, ""]]]
-    draw: Callable[[TaskState], UInt8[Array, "H W *C"]]  # the screen, 0..255, gray or RGB
+    draw: Callable[[TaskState], UInt8[Array, "H W *C"]]
     reads_gaze: bool = False
-    facts: Callable[[TaskState], dict[str, Array]] | None = None  # about the episode, for measures
-    # The first state of an episode, from the last one of the episode before; None where episodes are independent.
+    facts: Callable[[TaskState], dict[str, Array]] | None = None
     follow: Callable[[TaskState, Key[Array, ""]], TaskState] | None = None
 
 
@@ -109,9 +119,10 @@ def _take(task: Task, state: EnvState, action: Int[Array, ""], focal_point: Int[
 
 
 class JaxEnvironment:
-    """`num_envs` copies of a `Task` as an `envs.Environment`. Rewards are never clipped: they are in [-1, 1].
+    """Makes an `Environment` of `num_envs` copies of a `Task`, which step on the device.
 
-    Copy i draws from the key of `seed + i`. `recv` and `reset` give read-only arrays.
+    Copy i is seeded with `seed + i`. Rewards are not clipped: a task gives them in [-1, 1]. Only the task ends an
+    episode: `env.max_episode_steps` does not apply.
     """
 
     crop_top: int | None = None

@@ -35,11 +35,17 @@ from foajax.types import (
 
 @dataclasses.dataclass(frozen=True)
 class Agent:
-    """What an experiment's agent does; holds no arrays."""
+    """An experiment's agent as pure functions. It holds no arrays.
+
+    Attributes:
+      config: of the run.
+      num_actions: how many natural actions the game has.
+      crop_top: the first row of an Atari screen that is kept; None if screens are frames already.
+    """
 
     config: Config
-    num_actions: int  # natural actions of the game
-    crop_top: int | None  # first screen row kept; None where screens are frames already
+    num_actions: int
+    crop_top: int | None
 
     def __post_init__(self) -> None:
         check_window(self.config, self.sensor.window)
@@ -77,7 +83,7 @@ class Agent:
         return frames.initial_statistics((*env.frame_shape, *env.pixel_shape) if self._by_pixel else ())
 
     def initial_state(self, batch: int) -> ActorState:
-        """State of `batch` actors before their first episode; `is_first` of the first step completes it."""
+        """Returns the state of `batch` actors before their first step, whose `is_first` has to be true."""
         return ActorState(
             core_state=networks.initial_core_state(self.network, batch),
             focal_point=jnp.zeros((batch, 2), jnp.int32),
@@ -96,14 +102,23 @@ class Agent:
         *,
         greedy: bool = False,
     ) -> tuple[ActorOutput, NetworkOutput, ActorState]:
-        """One decision of each actor; samples both policies, or takes their modes where `greedy`.
-
-        The visual action chosen here moves the focal point that the *next* frame is sensed at. `key` is one, or one
-        an actor: then what an actor samples does not depend on who the others are.
+        """Decides once for each actor. The visual action moves the focal point at which the *next* frame is sensed.
 
         Saccades are paid one step late. The move chosen at t serves the decision at t+1, so its price is taken from
         the reward R_{t+2} of that decision. That is the reward that credits the move (`returns.vision_stream`): both
         heads see the price in their returns, the vision head right after the move. Before an end nothing is paid.
+
+        Args:
+          params: the network's parameters.
+          statistics: the frames' mean and deviation.
+          state: of the actors, from `initial_state` or from the last call.
+          timestep: what the environments show.
+          key: one random key; or one per actor, so that an actor's samples do not depend on the others.
+          greedy: whether the likeliest actions are taken; else both policies are sampled.
+
+        Returns:
+          The decisions (`natural_action`, `vision_action`, `focal_point` and more), the network's outputs, and the
+          actors' next state.
         """
         actors = state.age.shape[0]
         keys = jax.random.split(key, actors) if key.ndim == 0 else key

@@ -21,15 +21,28 @@ Carry = Any  # a pytree of arrays [B, ...]
 
 @runtime_checkable
 class Core(Protocol):
-    """Memory over T steps of B environments. What entered before an episode's first step must not reach it."""
+    """The memory of the network: a Flax module that reads T steps of B environments in order.
+
+    The state is any pytree of arrays [B, ...]. Where an episode begins, forget it: no step may depend on the episode
+    before.
+    """
 
     def initial_state(self, batch: int) -> Carry:
-        """The carry before the first step of all, without parameters."""
+        """Returns the state before the very first step. It may not use parameters."""
 
     def __call__(
         self, inputs: Float[Array, "T B F"], is_first: Bool[Array, "T B"], state: Carry
     ) -> tuple[Float[Array, "T B L"], Carry]:
-        """What the heads are given, and the carry that leaves the last step. `is_first[t]`: forget before step t."""
+        """Reads T steps.
+
+        Args:
+          inputs: features of each step, and what the network is told beside them.
+          is_first: true where an episode begins with the step: forget the state before it.
+          state: the state before the first of these steps.
+
+        Returns:
+          The outputs for the heads, and the state after the last step.
+        """
 
 
 class LSTM(nn.Module):

@@ -37,28 +37,47 @@ CHECKPOINTS = "checkpoints"
 
 
 class Actions(NamedTuple):
-    """What B agents do, and where they looked."""
+    """What B actors decided.
 
-    natural: Int[np.ndarray, "B"]  # counted from 0, held for `env.frame_skip` frames
-    vision: Int[np.ndarray, "B"]  # 0 where gaze is not learned
-    focal_point: Int[np.ndarray, "B 2"]  # (y, x) of the frames given, in frame pixels
+    Attributes:
+      natural: what to do: the environment's actions, counted from 0. Hold each for `env.frame_skip` frames.
+      vision: where to look next, as the gaze counts its actions; 0 if the gaze is not learned.
+      focal_point: where they looked to decide: (y, x) in frame pixels.
+    """
+
+    natural: Int[np.ndarray, "B"]
+    vision: Int[np.ndarray, "B"]
+    focal_point: Int[np.ndarray, "B 2"]
 
 
 @dataclasses.dataclass
 class TrainedAgent:
-    """An agent read from disk. `decide` goes from frame to frame and keeps memory, gaze and random numbers itself."""
+    """An agent read from disk. `decide` keeps its memory, gaze and random numbers from one frame to the next.
+
+    Attributes:
+      agent: the agent's pure functions.
+      params: the network's parameters.
+      statistics: the frames' mean and deviation, for their normalisation.
+      env_steps: how many decisions the agent was trained for.
+    """
 
     agent: Agent
     params: Params
     statistics: FrameStatistics
-    env_steps: int  # it has been trained for
+    env_steps: int
 
     def with_config(self, config: Config) -> TrainedAgent:
-        """The same agent where something else than its network differs, such as the game's rules."""
+        """Returns the same agent with another configuration, such as other rules of the game, but the same network."""
         return dataclasses.replace(self, agent=dataclasses.replace(self.agent, config=config))
 
     def reset(self, batch: int = 1, *, seed: int = 0, greedy: bool = False) -> None:
-        """Begins the episodes of `batch` actors; their policies are sampled, or with `greedy` their modes are taken."""
+        """Begins an episode for each of `batch` actors.
+
+        Args:
+          batch: how many decide in one call.
+          seed: of the actions, which are sampled.
+          greedy: whether the likeliest actions are taken instead.
+        """
         self._act = jax.jit(functools.partial(self.agent.act, greedy=greedy))
         self._state, self._starts = self.agent.initial_state(batch), np.ones(batch, bool)
         self._keys = iter(map(functools.partial(jax.random.fold_in, jax.random.key(seed)), itertools.count()))
@@ -66,17 +85,20 @@ class TrainedAgent:
     def decide(
         self, frames: np.ndarray, rewards: np.ndarray | None = None, *, starts: np.ndarray | None = None
     ) -> Actions:
-        """Decides on the next frames; the first call after `reset`, or none, begins the episodes.
+        """Decides what to do and where to look next. The first call begins the episodes, with or without `reset`.
 
         Args:
-          frames: uint8 [B, H, W], gray: Atari screens [B, 210, 160] where `env.crop`, else of `env.frame_shape`. With
-            `env.color` they are RGB, [B, H, W, 3].
-          rewards: float [B], what the last actions earned, as in training (clipped); None for 0.
-          starts: bool [B], whose episodes begin with this frame; None for nobody's.
+          frames: uint8 [B, H, W], gray; with `env.color` RGB, [B, H, W, 3]. They are Atari screens of 210x160 pixels if
+            the agent was trained with `env.crop`, and else of the size `env.frame_shape`.
+          rewards: float [B], what the last actions earned, clipped as in training; None for 0.
+          starts: bool [B], true where an episode begins with this frame; None if none does.
+
+        Returns:
+          An `Actions`: `natural`, `vision` and `focal_point`.
 
         Raises:
-          ValueError: frames of another type, shape or number.
-          RuntimeError: in a process that was forked from one that had JAX.
+          ValueError: the frames have another type, shape or number.
+          RuntimeError: the process was forked from one that had started JAX.
         """
         refuse_fork()
         if not hasattr(self, "_state"):
@@ -126,12 +148,12 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False) -> 
     """Reads a trained agent.
 
     Args:
-      path: a run's or an agent's directory, or the name of a shipped agent, e.g. `pong-constant70_packed`.
-      best: of a run, whether its best checkpoint by its score in training is read, and not the newest good one.
-      trust: whether code that its configuration names (`package.module:Name`) may be imported and run.
+      path: a directory of a run or an agent, or the name of a shipped agent, e.g. `pong-constant70_packed`.
+      best: of a run, read the checkpoint with the best score in training, not the newest.
+      trust: whether code that the agent's configuration names (`package.module:Name`) may run.
 
     Raises:
-      ConfigError: there is none, it cannot be read, or it would run code and `trust` is not given.
+      ConfigError: there is no agent, it cannot be read, or it names code and `trust` is false.
     """
     path = find(path)
     config = load_config(path)

@@ -1,4 +1,4 @@
-"""A logger beside ``metrics.jsonl`` and TensorBoard: Weights & Biases, or a class of one's own (`train.logger`)."""
+"""A logger beside ``metrics.jsonl`` and TensorBoard: Weights & Biases, or a user's class (`train.logger`)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from foajax.config.schema import Config
 
 @runtime_checkable
 class RowLogger(Protocol):
-    """Gets each row of ``metrics.jsonl`` too.
+    """Receives each row that goes to `metrics.jsonl`.
 
-    Each start of a run makes one, with `config=` the run's `Config` and `train.logger_kwargs`; of several processes the
-    first one alone. Training waits for it. What it raises becomes a warning, and training goes on.
+    Each start of a run makes one, with the arguments `config` and `train.logger_kwargs`; of several processes only the
+    first does. Training waits for it. If it raises, training prints a warning and goes on.
     """
 
     def log(self, row: Mapping[str, float], env_steps: int) -> None:
-        """Metrics by their names, those that are finite, at `env_steps` agent steps.
+        """Receives a row: metrics by name, without those that are not finite.
 
-        A resumed run gives the rows once more that had come after its checkpoint.
+        A resumed run repeats the rows after its checkpoint.
         """
 
     def close(self) -> None:
-        """The run is done or stops; not called where the process is killed or an environment hangs."""
+        """Is called when the run ends or stops, but not if the process is killed or an environment hangs."""
 
 
 class WandB:

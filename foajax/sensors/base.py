@@ -16,61 +16,63 @@ from foajax.sensors.geometry import PixelCount, Shape
 
 @runtime_checkable
 class Sensor(Protocol):
-    """A frame and a focal point in, one image or several out. A class of one's own inherits what it does not define.
+    """Makes one or more images of a frame and a focal point.
 
-    Conventions. The focal point is (y, x) in frame pixels, int32. An area of h x w pixels around it covers rows
-    y - h//2 .. y - h//2 + h - 1 (70 at y = 40: rows 5..74), columns likewise; an even area is thus centred on the
-    corner between four pixels. What lies outside the frame counts as 0 and what is hidden is 0: frames are normalised
-    before they are sensed. Values are not rescaled.
+    Define `window`, `sense`, `image_shapes` and `picture` in your own class; it inherits the rest. `sense` and
+    `picture` are pure functions of one gray frame, which JAX compiles and vmaps. Colours are sensed channel by channel.
 
-    `sense` and `picture` are pure functions of one gray frame, which JAX compiles and vmaps; colours are sensed one
-    channel at a time.
+    The focal point is (y, x) in frame pixels, int32. An area of h x w pixels around it covers rows y - h//2 to
+    y - h//2 + h - 1, and columns likewise: 70 rows at y = 40 are rows 5 to 74. What is hidden, or outside the frame, is
+    0. Training normalises frames before they are sensed, so that 0 is what never changes. Values are not rescaled.
+
+    Attributes:
+      window: height and width of the focal area, frame pixels.
     """
 
-    window: Shape  # height and width of the focal area, frame pixels
+    window: Shape
 
     def sense(self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str) -> tuple[Array, ...]:
-        """What is seen of a frame, float32 images [h, w] of `image_shapes`.
+        """Returns what is seen of a frame: float32 images [h, w], whose shapes are `image_shapes`.
 
-        With bounds 'window' the focal area lies inside the frame; with 'point' it may overhang.
+        With bounds 'window' the focal area is inside the frame; with 'point' it may overhang.
         """
 
     def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
-        """Heights and widths of what `sense` gives."""
+        """Returns (h, w) of each image of `sense`."""
 
     def picture(
         self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
     ) -> Float[Array, "H W"]:
-        """What `sense` gave, put back in the frame's place; 0 where nothing was seen."""
+        """Draws the images of `sense` at their place in a frame of zeros."""
 
     def count(self, frame_shape: Shape) -> PixelCount:
-        """The pixel budget for a frame that the focal area fits into."""
+        """Counts the values that are seen of a frame, at least as large as the focal area."""
         values = sum(math.prod(shape) for shape in self.image_shapes(frame_shape))
         return PixelCount(values, values)
 
     @property
     def packed(self) -> Sensor:
-        """The sensor that gives the same values, each once."""
+        """The sensor in the packed layout: it gives the same values without a canvas."""
         return self
 
     @property
     def in_place(self) -> bool:
-        """Whether the image is a frame with each value at its place, so that it tells where it was taken."""
+        """Whether `sense` gives a canvas: an image of the frame's size with each value at its place."""
         return False
 
     @property
     def areas(self) -> tuple[Shape, ...]:
-        """Heights and widths of the areas to be drawn around the focal point, inner to outer."""
+        """Heights and widths of the outlines that pictures draw around the focal point, inner to outer."""
         return (self.window,)
 
     @property
     def finest(self) -> Shape:
-        """Height and width of the part that is seen best, frame pixels."""
+        """Height and width of the part that is seen best, frame pixels: what `gaze.bounds=fovea` keeps inside."""
         return self.areas[0]
 
     @property
     def is_round(self) -> bool:
-        """Whether they are ellipses."""
+        """Whether these outlines are ellipses; else they are rectangles."""
         return False
 
 

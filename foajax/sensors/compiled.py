@@ -1,7 +1,4 @@
-"""`sense` and `picture` for programs of one's own: compiled once for a sensor and a frame's shape, then milliseconds.
-
-They may be called inside of `jax.jit`, `jax.vmap` and `jax.grad` too.
-"""
+"""`sense` and `picture` for other programs: compiled once per sensor and frame shape, then milliseconds."""
 
 from __future__ import annotations
 
@@ -30,23 +27,24 @@ def sense(
     sensor: SensorConfig | Sensor,
     bounds: str = "point",
 ) -> tuple[Float[Array, "_ _ _"], ...]:
-    """What a sensor sees of one frame.
+    """Returns what a sensor sees of one frame. You may call it inside `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Args:
-      frame: uint8 or finite float, [H, W] or [H, W, C] of any size and range, NumPy's or JAX's.
-      focal_point: (y, x), frame pixels, integers.
-      sensor: a `RingSensor`, a `LogPolarSensor`, or a `Sensor` of one's own.
-      bounds: 'point', so that the focal area may overhang the frame, where it sees 0; or 'window', so that it is moved
-        inside, which takes about two thirds of the time.
+      frame: a NumPy or JAX array [H, W] or [H, W, C] of any size, uint8 or finite floats of any range.
+      focal_point: (y, x) in frame pixels, integers.
+      sensor: a `RingSensor`, a `LogPolarSensor`, or an object of your own `Sensor` class.
+      bounds: with 'point' the focal area may overhang the frame and sees 0 there; with 'window' it is moved inside
+        first, which is faster.
 
     Returns:
-      float32 images [h, w, C], C 1 for a gray frame, in the frame's range: one for a canvas, one for each ring and
-      for the periphery where the layout is packed, [rings, wedges, C] for a log-polar sensor.
+      A tuple of float32 images [h, w, C] in the frame's range of values; C is 1 for a gray frame. The layout 'canvas'
+      gives one image of the frame's size, with 0 where nothing is seen. The layout 'packed' gives an image per ring,
+      inner to outer, then one of the periphery if there is one. A `LogPolarSensor` gives one image [rings, wedges, C].
 
     Raises:
-      ConfigError: a frame or a focal point of another rank; a focal point of fractions; a peripheral grid finer than
-        the frame; other bounds, or 'window' and an area larger than the frame.
-      RuntimeError: in a process that was forked from one that had JAX.
+      ConfigError: the frame or the focal point has another rank; the focal point is not of integers; the peripheral
+        grid is finer than the frame; `bounds` is unknown, or 'window' with an area larger than the frame.
+      RuntimeError: the process was forked from one that had started JAX.
     """
     refuse_fork()
     return _sense(frame, focal_point, sensor=make_sensor(sensor), bounds=bounds)
@@ -67,16 +65,17 @@ def picture(
     sensor: SensorConfig | Sensor,
     frame_shape: Shape,
 ) -> Float[Array, "H W C"]:
-    """What `sense` gave, put back in the frame's place; 0 where nothing was seen.
+    """Draws what `sense` returned at its place in a frame of zeros.
 
     Args:
-      images: from `sense`.
-      focal_point: (y, x), frame pixels, where the area lay: with bounds 'window', after it was moved inside.
-      sensor: the same.
-      frame_shape: (H, W).
+      images: what `sense` returned.
+      focal_point: (y, x) in frame pixels, where they were sensed. With bounds 'window' that is the point after the area
+        was moved inside.
+      sensor: the sensor that sensed them.
+      frame_shape: (H, W) of the frame.
 
     Returns:
-      float32 [H, W, C], in the images' range.
+      A frame, float32 [H, W, C], in the images' range of values.
     """
     refuse_fork()
     images, focal_point = jax.tree.map(jnp.asarray, (tuple(images), focal_point))

@@ -1,16 +1,9 @@
 """The sensors for other libraries: Gymnasium environments whose pixels are looked at through a gaze.
 
-An action has the environment's own part and a visual one, 0 .. V-1 as in `foajax.sensors.gaze`. The visual action moves
-the focal point before the frame that the step leads to is sensed, as in `foajax.learning.agent`; where an episode
-starts, the focal point is at the gaze's start instead. A price of saccades (`gaze.cost`) is taken from the reward one
-step late, as in training.
+The order is that of training (`foajax.learning.agent`): a visual action moves the focal point before the frame that the
+step leads to is sensed, and a price of saccades (`gaze.cost`) is taken from the reward one step late.
 
-An observation is `{"image": [h, w, c], "focal_point": [2]}`, or `image_0`, `image_1`, ... where the sensor gives
-several images (see `foajax.sense`). Images have 0 for what is hidden; colours and stacked frames are channels, the last
-axis. The focal point is (y, x) in [-1, 1]. The info dict has `focal_point`, (y, x) in frame pixels; `saccade`, how far
-it moved for this frame; `values`, how many values the sensor shows of a frame.
-
-NumPy senses, and JAX is not imported, but for a sensor of one's own.
+NumPy senses. JAX is imported for a user's own sensor only.
 """
 
 from __future__ import annotations
@@ -30,22 +23,33 @@ from foajax.sensors.pixels import dtype_name
 
 
 class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
-    """One environment, seen through a sensor.
+    """Shows a Gymnasium environment through a sensor, and adds an action that moves the gaze.
+
+    An action has two parts: `natural` is the environment's own action, `vision` (an integer from 0) moves the focal
+    point before the next frame is sensed. By default 0 stays, and 1 to 4 move up, down, left, right.
+
+    An observation is a dict of `image` [h, w, c] and `focal_point`, (y, x) in [-1, 1]. A sensor of several images gives
+    `image_0`, `image_1`, ... as `foajax.sense` orders them. What is hidden is 0. Colours and stacked frames are
+    channels.
+
+    The info dict has `focal_point`, (y, x) in frame pixels; `saccade`, how far it moved to this frame; and `values`,
+    how many values the sensor shows of it.
 
     Args:
-      env: observes a `Box` of unsigned integers or floats: [H, W], [H, W, C], [C, H, W], or a stack of such images, of
-        8x8 and more; or a `Dict` that has one.
-      sensor: a `RingSensor`, a `LogPolarSensor`, a `Sensor` of one's own, or the name of an experiment whose sensor and
-        gaze it stands for.
-      gaze: how the focal point moves; None for the experiment's, or the defaults. A random start is drawn from the
-        environment's `np_random`.
-      image_key: where the image is in a `Dict`, whose other parts are passed on.
-      dtype: of the images: float32, integers scaled to [0, 1]; or uint8, 0..255, for replay buffers.
-      actions: their form: 'dict' {"natural", "vision"}, 'tuple' (natural, vision), 'multidiscrete' [natural, vision].
+      env: an environment that observes a `Box` of unsigned integers or floats: [H, W], [H, W, C], [C, H, W], or a stack
+        of such images, 8x8 or larger; or a `Dict` with such a `Box`.
+      sensor: a `RingSensor`, a `LogPolarSensor`, an object of your own `Sensor` class, or the name of an experiment,
+        which stands for its sensor and its gaze.
+      gaze: how the focal point moves. None takes the experiment's gaze, or else the defaults. A random start is drawn
+        from the environment's `np_random`.
+      image_key: the key of the image in a `Dict`. The other entries are passed on.
+      dtype: type of the images. float32 has integers scaled to [0, 1]; uint8 has 0..255, for small replay buffers.
+      actions: form of an action: 'dict' {"natural", "vision"}, 'tuple' (natural, vision) or 'multidiscrete' [natural,
+        vision].
 
     Raises:
-      ConfigError: not a pixel environment, a sensor that is none or does not fit its frames, an unknown name, a gaze
-        that is none or takes no visual actions, or a form that does not suit the environment's own actions.
+      ConfigError: the environment observes no such image; the sensor is unknown or does not fit the frames; the gaze
+        takes no visual actions; or `actions` does not suit the environment's own actions.
     """
 
     def __init__(
@@ -70,11 +74,11 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
 
     @property
     def focal_point(self) -> np.ndarray:
-        """(y, x) in frame pixels, int32 [2]: where the last frame was sensed."""
+        """Where the last frame was sensed: (y, x) in frame pixels, int32 [2]."""
         return self._eye.focal_point[0]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        """Begins an episode, with the focal point at the gaze's start."""
+        """Begins an episode. The focal point is where `gaze` starts."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._ended = False
         self._eye.begin(np.array([True]), self._random)
@@ -83,7 +87,8 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
     def step(self, action: Any) -> tuple[dict, Any, bool, bool, dict]:
         """Takes the natural action, moves the focal point and senses the new frame there.
 
-        `ConfigError`, a `ValueError`, for what is no action.
+        Raises:
+          ConfigError: `action` is not in the action space.
         """
         natural, vision = split(self._form, action, self.env.action_space, self._eye.num_vision, ())
         observation, reward, terminated, truncated, info = self.env.step(natural)
@@ -102,21 +107,22 @@ class FoveatedObservation(gymnasium.Wrapper, gymnasium.utils.RecordConstructorAr
 
 
 class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
-    """Many environments at once, seen through a sensor each.
+    """Shows each environment of a vector through a sensor, with a gaze of its own; see `FoveatedObservation`.
+
+    Every autoreset mode of Gymnasium works. In the same-step mode the last observations, `info["final_obs"]`, are
+    sensed too.
 
     Args:
-      env: a vector environment of Gymnasium, ale-py's `AtariVectorEnv` or a Gymnasium pool of EnvPool; one environment
-        of it is as in `FoveatedObservation`. Episodes may restart on the next step, on the step that ends them, whose
-        last observations are in `info["final_obs"]` and are sensed too, or not by themselves.
+      env: a vector environment of Gymnasium, ale-py's `AtariVectorEnv`, or a Gymnasium pool of EnvPool.
       sensor: as in `FoveatedObservation`.
-      gaze: as in `FoveatedObservation`. Random starts are drawn from a generator of the wrapper's own, seeded by
-        `reset(seed=)`.
+      gaze: as in `FoveatedObservation`, but random starts are drawn from the wrapper's own generator, which
+        `reset(seed=)` seeds.
       image_key: as in `FoveatedObservation`.
       dtype: as in `FoveatedObservation`.
       actions: as in `FoveatedObservation`.
 
     Raises:
-      ConfigError: as in `FoveatedObservation`, or an environment that does not say how its episodes restart.
+      ConfigError: as in `FoveatedObservation`; or the environment's metadata has no `autoreset_mode`.
     """
 
     def __init__(
@@ -147,11 +153,11 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
 
     @property
     def focal_point(self) -> np.ndarray:
-        """(y, x) in frame pixels, int32 [B, 2]: where the last frames were sensed."""
+        """Where the last frames were sensed: (y, x) in frame pixels, int32 [B, 2]."""
         return self._eye.focal_point
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        """Begins the episodes, those of `options["reset_mask"]` where it is given; `seed` may be a list."""
+        """Begins all episodes, or those that `options["reset_mask"]` is true for. `seed` may be a list."""
         if seed is not None:
             self._generator = np.random.default_rng([s or 0 for s in np.atleast_1d(seed)])
         started = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
@@ -161,7 +167,7 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
         return self._eye.look(observation), info | self._facts()
 
     def step(self, actions: Any) -> tuple[dict, Any, Any, Any, dict]:
-        """A step of each. Where episodes restart on the next step, that step ignores its action."""
+        """Steps every environment. In the next-step mode, the step that restarts an episode ignores its action."""
         natural, vision = split(self._form, actions, self._own, self._eye.num_vision, (self.num_envs,))
         observation, reward, terminated, truncated, info = self.env.step(natural)
         self._eye.begin(self._ended, self._random)

@@ -75,17 +75,17 @@ def start(config: Config) -> None:
 
 
 def train_agent(config: Config) -> TrainedAgent:
-    """Trains one agent, or goes on training it, in this process; gives it as its newest checkpoint has it.
+    """Trains an agent in this process, or resumes its training, and returns it as its newest checkpoint has it.
 
-    As `python -m foajax.train` does, it writes to `config.run_dir`, prints to stderr and keeps compiled programs. It
-    may be called from any thread; in the main one, SIGINT, SIGTERM and SIGUSR1 end it early, with all that was learned
-    saved. An environment that hangs for longer than `env.timeout` ends the process.
+    As `foajax train` does, it writes to `config.run_dir`, prints progress and caches compiled programs. You may call it
+    from any thread. In the main thread, SIGINT, SIGTERM and SIGUSR1 save the run and end the call early. An environment
+    that hangs for longer than `env.timeout` seconds ends the process.
 
     Args:
-      config: from `foajax.compose([...])`.
+      config: what `foajax.compose` returns.
 
     Raises:
-      ConfigError: a run that cannot be made, or a directory that is another run's; one line for the user.
+      ConfigError: there is no such run, or the directory belongs to another run.
       EnvironmentFault: an environment raised; what was learned is saved.
     """
     use_compilation_cache()

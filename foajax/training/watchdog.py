@@ -40,7 +40,7 @@ _METHODS = ("reset", "send", "recv", "close")  # of an environment: what may rai
 
 
 class EnvironmentFault(Exception):
-    """An environment that raised; the message is one line that names it and the error."""
+    """An environment raised. The message is one line that names the environment and its error."""
 
 
 class Call(NamedTuple):
