@@ -9,20 +9,20 @@ import sys
 from foajax.config.parse import refuse
 
 COMMANDS = {
-    "demo": "Lets an agent that is shipped play a game, to be watched in a browser.",
+    "demo": "Lets a shipped agent play a game, to watch in a browser.",
     "train": "Trains one agent, or a sweep of them, or goes on training.",
     "evaluate": "Plays whole games with a trained agent and prints its scores.",
     "player": "Writes one game as a page to play, scrub and study.",
     "render": "Writes whole games as videos, and a heat map of where the agent looked.",
-    "show": "Draws what a sensor sees.",
+    "show": "Draws what a sensor sees of a game.",
     "report": "Writes curves, scores, heat maps and costs of a set of runs as one page.",
     "cost": "Measures what a decision costs, sensor by sensor.",
     "status": "Shows what every run below some directories is doing.",
     "reproduce": "Runs the paper's comparison, stage by stage.",
     "export": "Writes a folder that runs an agent without JAX and foajax.",
-    "store": "Makes an agent to be shipped from a run.",
+    "store": "Makes an agent to ship from a run.",
     "doctor": "Tells what is installed, which devices there are, and what is missing.",
-    "keep": "Keeps in results/runs/ what others need to judge and repeat a run.",
+    "keep": "Copies what others need to judge and repeat a run into results/runs/.",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import inspect
 import json
@@ -13,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from foajax.config.parse import ConfigError, Section, SectionT, build, refuse, replace, schema_of
+from foajax.config.parse import ConfigError, Section, SectionT, build, refuse, replace, schema_of, suggest
 from foajax.config.table import listed
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it
@@ -34,8 +35,21 @@ def override(config: SectionT, arguments: Sequence[str], prefix: str, keys: Sequ
     values = _values([word.removeprefix(f"{prefix}.") for word in arguments], type(config), f"{prefix}.")
     for key, value in values.items():
         if key not in keys:
-            raise refuse(f"{prefix}.{key}", value, keys, why="cannot be changed", near=key)
+            near = [f"{prefix}.{each}" for each in difflib.get_close_matches(key, keys, n=1)]
+            is_known = key in type(config).model_fields
+            why = "cannot be changed" if is_known else suggest("unknown key", *near)
+            raise refuse(f"{prefix}.{key}", value, f"one of {', '.join(f'{prefix}.{each}' for each in keys)}", why=why)
     return replace(config, **values)
+
+
+def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The directories among the words, which a sweep may have named with a "=", and the other words."""
+    directories = [word for word in arguments if "=" not in word or os.path.isdir(word)]
+    others = [word for word in arguments if word not in directories]
+    for word in others:
+        if word.startswith("run="):
+            raise refuse(word, accepted=f"{word.removeprefix('run=')}, without run=")
+    return directories, others
 
 
 def _values(arguments: Sequence[str], cls: type[Section], prefix: str) -> dict[str, Any]:
@@ -44,7 +58,12 @@ def _values(arguments: Sequence[str], cls: type[Section], prefix: str) -> dict[s
     for word in arguments:
         key, separator, text = word.partition("=")
         if not separator:
-            raise refuse(f"{prefix}{word}", accepted=f"key=value with one of {', '.join(prefix + key for key in keys)}")
+            names = ", ".join(prefix + key for key in keys)
+            raise refuse(
+                f"{prefix}{word}",
+                accepted=names and f"key=value with one of {names}",
+                why="" if names else "the command takes no words",
+            )
         values[key] = _value(prefix + key, text, keys.get(key, {}))
     return values
 
@@ -71,7 +90,7 @@ def check_file(key: str, path: str | None) -> None:
         return
     file = Path(path).absolute()
     if file.is_dir() or not file.parent.is_dir() or not os.access(file if file.exists() else file.parent, os.W_OK):
-        raise refuse(key, path, "a file, to write, in a directory that exists")
+        raise refuse(key, path, "a file that can be written, in a directory that exists")
 
 
 def write_json(key: str, path: str, found: Any) -> None:

@@ -1,14 +1,13 @@
-"""`python -m foajax.cost experiments=constant70_packed,nonfoa`: what a decision costs, sensor by sensor.
+"""Measures what a decision costs, sensor by sensor: `foajax cost experiments=constant70_packed,nonfoa`.
 
-A decision is sense, torso, LSTM, heads and sampling, from a frame that is preprocessed and normalised
-already; no game is started. FLOPs are XLA's count of the program *before* it is compiled for a device:
-2 for a multiply-add of a convolution or matrix product, 1 for any other elementwise operation. So they
-depend on neither the device nor what XLA fuses; but a loop counts as one turn, and thus the sensor's
-repair of an area that overhangs the frame counts even where none does. Times are medians of repeats
-that take turns, so that whatever else the machine does slows all experiments alike.
+A decision is sense, torso, LSTM, heads and sampling, from a preprocessed, normalised frame; no game is started. FLOPs
+are XLA's count of the program before it compiles it for a device: 2 per multiply-add of a convolution or matrix
+product, 1 per other elementwise operation. So they do not depend on the device. A loop counts as one turn, and the
+sensor's repair of an area that overhangs the frame always counts. Times are medians of repeats; experiments take turns,
+so that other load on the machine slows all of them alike.
 
-`target=onnx` times the folders that `foajax.export` writes, from a screen and from a camera's image to the next focal
-point, on one thread (extra `robot`).
+`target=onnx` times the folders that `foajax export` writes, on one thread (extra `robot`): from a screen, and from a
+camera's image, to the next focal point.
 """
 
 from __future__ import annotations
@@ -36,28 +35,37 @@ from foajax.runtime import wait_in_place
 class Options(Section):
     """What the command takes."""
 
-    experiments: str | None = Field(None, description="Names with commas between them; null for all.")
-    torso: Literal["nature", "a3c"] = Field("nature", description="Choice of the group network/.")
-    json_file: str | None = Field(None, alias="json", description="File for the result.")
+    experiments: str | None = Field(None, description="Experiments, with commas between them; null for all.")
+    torso: Literal["nature", "a3c"] = Field("nature", description="The network's convolutions.")
+    json_file: str | None = Field(None, alias="json", description="JSON file to write the result to.")
     color: bool = Field(False, alias="env.color", description="Frames in colour; else gray.")
     repeats: int = Field(50, ge=1, description="Repeats of each timing.")
     target: Literal["jax", "onnx"] = Field("jax", description="What runs: JAX, or the folders that export writes.")
-    dtype: Literal["float32", "float16", "int8"] = Field("float32", description="Of the weights, where target=onnx.")
+    dtype: Literal["float32", "float16", "int8"] = Field(
+        "float32", description="Type of the weights where target=onnx."
+    )
 
     def check(self) -> None:
         cli.check_file("json", self.json_file)
+        for name in self.names:
+            if name not in (known := list_experiments()):
+                raise refuse("experiments", name, known)
+
+    @property
+    def names(self) -> list[str]:
+        """The experiments to measure."""
+        return list_experiments() if self.experiments is None else self.experiments.split(",")
 
 
 def cost(arguments: Sequence[str]) -> None:
     """The command."""
     options = cli.parse(Options, arguments)
     wait_in_place()
-    names = list_experiments() if options.experiments is None else options.experiments.split(",")
     if options.target == "onnx":
-        records = _exported(names, options)
+        records = _exported(options.names, options)
         _print_exported(records)
     else:
-        records = measure(names, torso=options.torso, color=options.color, repeats=options.repeats)
+        records = measure(options.names, torso=options.torso, color=options.color, repeats=options.repeats)
         _print(records)
     if options.json_file:
         bench.write("json", options.json_file, records, ["python", "-m", "foajax.cost", *arguments])
@@ -67,7 +75,7 @@ def _exported(names: Sequence[str], options: Options) -> list[dict[str, Any]]:
     try:
         from foajax.robot import latency
     except ImportError as error:
-        raise refuse("target", "onnx", "foajax[robot]", why=f"{error.name} is missing") from None
+        raise refuse("target", "onnx", "", why=f"{error.name} is missing (pip install 'foajax[robot]')") from None
     return latency.measure(
         names, torso=options.torso, color=options.color, dtype=options.dtype, repeats=options.repeats
     )

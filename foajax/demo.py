@@ -1,7 +1,7 @@
-"""`python -m foajax.demo`: a shipped agent plays one game, which is then a page to watch. Nothing is trained.
+"""Lets a shipped agent play one game and writes a page to watch it: `foajax demo`. Nothing is trained.
 
-Of the agents for a game, the best one that chooses where to look plays; `agent=` takes another. An agent that searches
-plays some scenes, of which the longest successful search is shown.
+Of the agents for a game that choose where to look, the best one plays; `agent=` takes another. In visual search it
+plays several scenes, and the page shows the longest successful one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Options(Section):
     seed: int = Field(0, description="Seed of the game.")
     steps: int = Field(6000, ge=1, description="Decisions at most; 6,000 are seven minutes of an Atari game.")
     open: bool | None = Field(None, description="Show the page in the browser; null to be asked on a terminal.")
-    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
+    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
 
 def choose(directory: Path, game: str | None) -> Path:
@@ -72,7 +72,7 @@ def demo(arguments: Sequence[str]) -> None:
     """The command; prints what is played, the score, the page's address and what to look at."""
     options = cli.parse(Options, arguments)
     path = Path(options.agent) if options.agent else choose(agents(), options.game)
-    stored, directory = load_agent(path, trust=options.trust), cli.make_directory(options.out)
+    stored, directory = load_agent(path, trust=options.trust, key="agent"), cli.make_directory(options.out)
     if options.game not in (None, stored.agent.config.game):
         raise refuse("game", options.game, f"null or {stored.agent.config.game}", why=f"agent={path} plays another")
     use_compilation_cache()

@@ -1,6 +1,6 @@
-"""`python -m foajax.doctor`: what is installed, which devices there are, and what each extra would add.
+"""Tells what is installed, which devices there are, and what each extra would add: `foajax doctor`.
 
-The exit code is 1 where a package that foajax needs is missing or of another version than it needs.
+The exit code is 1 where a package that foajax needs is missing or has another version.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""`python -m foajax.evaluate run=<dir>`: an agent's score in 100 whole games, unclipped.
+"""Plays 100 whole games with a trained agent and prints its unclipped score: `foajax evaluate run=<dir>`.
 
-The games are those of the agent's training, with seeds of their own. `env.<key>=value` changes them, for another
-protocol: `env.sticky_actions=0.25`, `env.episodic_life=false` (the agent has to start each life itself),
-`env.max_episode_steps=4500`. A game that reaches the last of these, 27,000 decisions by default, is cut and counted.
+The games are those of the agent's training, with other seeds. `env.<key>=value` changes their rules:
+`env.sticky_actions=0.25`, `env.episodic_life=false` (the agent has to start each life itself) or
+`env.max_episode_steps=4500`. A game of `env.max_episode_steps` decisions, 27,000 by default, is cut and counts.
 `search.<key>=value` changes the scenes of visual search: `search.set_sizes=[1,4,8,16]`.
 """
 
@@ -44,10 +44,10 @@ class Options(Section):
     checkpoint: Literal["newest", "best"] = Field(
         "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
     )
-    json_file: str | None = Field(None, alias="json", description="File for the result.")
+    json_file: str | None = Field(None, alias="json", description="JSON file to write the result to.")
     num_envs: int = Field(25, ge=1, description="Games played at once.")
     seed: int = Field(0, description="Seed of the games.")
-    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
+    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
     def check(self) -> None:
         cli.check_file("json", self.json_file)

@@ -1,8 +1,8 @@
-"""`python -m foajax.export run=<run or agent> out=robot/`: a folder that runs the agent without JAX and this package.
+"""Writes a folder that runs an agent without JAX and foajax: `foajax export run=<run or agent> out=robot/`.
 
-The folder holds the network (`policy.onnx`), `agent.py` that decides with it, `camera.py` and `node.py` that look
-through a camera, and 200 recorded decisions that `python agent.py --check` replays. Nothing is written where that check
-fails. It needs the extra `robot`.
+The folder holds the network (`policy.onnx`), `agent.py`, which decides with it, and `camera.py` and `node.py`, which
+look through a camera. `python agent.py --check` replays 200 recorded decisions. If that check fails, nothing
+is written. The command needs the extra `robot`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Options(Section):
     """What the command takes."""
 
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
-    out: str = Field(description="The folder.")
+    out: str = Field(description="Directory of the folder to write.")
     checkpoint: Literal["newest", "best"] = Field(
-        "newest", description="Of a run: the latest, or that with the best score in training."
+        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
     )
     dtype: Literal["float32", "float16", "int8"] = Field(
-        "float32", description="Of the weights; float16 halves the file, int8 thirds it and is less exact."
+        "float32", description="Type of the weights; float16 halves the file, int8 thirds it and is less exact."
     )
-    stablehlo: bool = Field(False, description="Whether the whole decision is written as a program for JAX too.")
-    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
+    stablehlo: bool = Field(False, description="Write the whole decision as a program for JAX too.")
+    trust: bool = Field(False, description="Let code run that the run's configuration names.")
 
 
 def export(arguments: Sequence[str]) -> None:
@@ -41,7 +41,7 @@ def export(arguments: Sequence[str]) -> None:
         import onnx  # noqa: F401
         import onnxruntime  # noqa: F401
     except ImportError as error:
-        raise refuse("export", accepted="foajax[robot]", why=f"{error.name} is missing") from None
+        raise refuse("export", accepted="", why=f"{error.name} is missing (pip install 'foajax[robot]')") from None
     from foajax.robot import folder
 
     stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)

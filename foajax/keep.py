@@ -1,9 +1,9 @@
-"""`python -m foajax.keep run=<dir>`: keeps of a run what others need to judge and repeat it, in `results/runs/<game>/`.
+"""Copies what others need to judge and repeat a run into `results/runs/<game>/`: `foajax keep run=<dir>`.
 
-Into a directory of the run's own go its resolved configuration, `metrics.jsonl` thinned to 500 rows, what `evaluate
-json=<run>/score.json` has found, the heat map that `render` has left in `<run>/render`, and `run.json`: command,
-commits, seed, machine, hours. Then the table of kept runs, docs/results.md with its figures, the README's block and the
-table of measurements in `results/bench/` are made anew. Without `run=`, only that.
+It copies the resolved configuration, `metrics.jsonl` thinned to 500 rows, the result of
+`evaluate json=<run>/score.json`, and the heat map in `<run>/render`. `run.json` states command, commits, seed, machine
+and hours. Then it makes anew: the table of kept runs, docs/results.md with its figures, the README's block, and the
+table of measurements in `results/bench/`. Without `run=` it does only that.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ class Options(Section):
     """What the command takes."""
 
     run: str | None = Field(None, description="A run's directory; null to make the tables and figures anew only.")
-    name: str | None = Field(None, description="Directory that it is kept in; null for <experiment>-s<seed>.")
+    name: str | None = Field(None, description="Directory to keep it in; null for <experiment>-s<seed>.")
+
+    def check(self) -> None:
+        if self.name is not None and self.run is None:
+            raise refuse("name", self.name, "null, or a name beside run=<dir>")
 
 
 def keep(arguments: Sequence[str]) -> None:

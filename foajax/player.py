@@ -1,6 +1,6 @@
-"""`python -m foajax.player run=<dir> out=player`: one recorded game as a page to play, scrub and study.
+"""Plays one game with a trained agent and writes it as a page to study: `foajax player run=<dir> out=player`.
 
-The page is one file and needs nothing else, no network and no server.
+The page is one file; it needs no network and no server.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Options(Section):
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
     seed: int = Field(0, description="Seed of the game.")
     steps: int | None = Field(None, ge=1, description="Cut the game after so many decisions; null for the whole game.")
-    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
+    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
 
 def player(arguments: Sequence[str]) -> None:

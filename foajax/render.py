@@ -1,8 +1,8 @@
-"""`python -m foajax.render run=<dir> episodes=1`: whole games as videos, and where the agent looked.
+"""Writes whole games as videos, and a heat map of where the agent looked: `foajax render run=<dir>`.
 
-Writes `episode-<seed>.mp4` (a GIF of the first 1,000 steps where the extra `video` is not installed), `heatmap.png` and
-`heatmap.json`, at the speed at which the game is played: 15 decisions a second on Atari with its 60 frames and a frame
-skip of 4. Of a scene of visual search also `scanpath-<seed>.png`: its fixations in order, and what was seen at each.
+The files are `episode-<seed>.mp4`, `heatmap.png` and `heatmap.json`. Without the extra `video`, a GIF of the first
+1,000 steps replaces the MP4. A video runs at the game's speed: 15 decisions per second on Atari with a frame skip of 4.
+In visual search, `scanpath-<seed>.png` shows the fixations in order, and what was seen at each.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ class Options(Section):
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
     seed: int = Field(0, description="Seed of the first game; the next one has the next seed.")
     steps: int | None = Field(None, ge=1, description="Cut a game after so many decisions; null for whole games.")
-    format: Literal["mp4", "gif"] | None = Field(None, description="Of videos; null for mp4 where that can be written.")
+    format: Literal["mp4", "gif"] | None = Field(
+        None, description="Format of videos; null for mp4 where it can be written."
+    )
     video: bool = Field(True, description="Write videos; false for the pictures alone.")
-    trust: bool = Field(False, description="Whether code that the agent's configuration names may run.")
+    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
     def check(self) -> None:
         if self.format == "mp4" and (why := why_no_mp4()):

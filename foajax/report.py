@@ -1,14 +1,15 @@
-"""`python -m foajax.report runs/<a> runs/<b> ... out=report`: a set of runs as one page that needs nothing else.
+"""Writes a set of runs as one page: `foajax report runs/<a> runs/<b> ... out=report`.
 
-Learning curves, final scores, where the agents look, what they cost and how they differ. Runs of the same experiment
-on the same game are seeds of one another. Each figure is written as a PNG as well. What `render`, `player
-out=<run>/player` and `evaluate json=<run>/score.json` have left in a run's directory is taken up. A heat map that is
-not there, or not of whole games that the newest checkpoint played with sampled actions, is made, unless `episodes=0`.
+The page needs no other file. It shows learning curves, final scores, where the agents look, what they cost and how they
+differ. Runs of the same experiment on the same game count as seeds. Each figure is written as a PNG too.
+
+The report uses what `render`, `player out=<run>/player` and `evaluate json=<run>/score.json` left in a run's directory.
+It makes a missing heat map itself, unless `episodes=0`. A heat map counts as missing unless the newest checkpoint
+played it, in whole games with sampled actions.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,26 +30,25 @@ class Options(Section):
 
     out: str = Field("report", description="Directory of the page.")
     preset: Literal["constant", "decreasing", "peripheral"] | None = Field(
-        None, description="Only the experiments of a figure of the paper."
+        None, description="Show only the experiments of one of the paper's figures."
     )
     episodes: int = Field(3, ge=0, description="Games for a heat map that has to be made; 0 for none.")
     repeats: int = Field(50, ge=0, description="Repeats of each timing of a decision; 0 for no costs.")
-    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
+    trust: bool = Field(False, description="Let code run that the run's configuration names.")
 
 
 def report(arguments: Sequence[str]) -> None:
     """The command; prints the path of the page."""
-    # A sweep's directories may have "=" in their names.
-    paths = [word for word in arguments if "=" not in word or os.path.isdir(word)]
-    options = cli.parse(Options, [word for word in arguments if word not in paths])
+    paths, others = cli.split(arguments)
+    options = cli.parse(Options, others)
     if not paths:
-        raise refuse("no runs", accepted="report runs/<a> runs/<b> ... out=report")
+        raise refuse("no runs", accepted="foajax report runs/<a> runs/<b> ... out=report")
     wait_in_place()
     runs = [read_run(path, trust=options.trust) for path in dict.fromkeys(map(Path, paths))]
     games = games_of(runs, options.preset)
     shown = {run.path for run in runs_of(games)}
-    if others := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:
-        note(f"preset={options.preset} leaves out {', '.join(others)}")
+    if hidden := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:
+        note(f"preset={options.preset} leaves out {', '.join(hidden)}")
     cli.make_directory(options.out)  # before games are played for what could not be written
     maps = find_maps(games, options.episodes)
     try:

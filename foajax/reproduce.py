@@ -1,12 +1,9 @@
-"""`python -m foajax.reproduce stage=1 jobs=2`: the paper's comparison, run by run, each evaluated in 100 games.
+"""Runs the paper's comparison and evaluates each run in 100 games: `foajax reproduce stage=1 jobs=2`.
 
-Where a gaze is learned, ten more games make its heat map.
-
-`experiments/plans/paper.yaml` has the stages; `plan=search` takes those of visual search. A run that is finished is
-skipped and one that was stopped goes on, so the same command is given again and again until nothing is left.
-`show=table` says how far each run is; `show=commands` prints a command for each run that is left, as for the tasks of a
-cluster's job array. `python -m foajax.keep run=<dir>` keeps a run in results/ and writes what it says to
-docs/results.md.
+Each learned gaze plays ten more games for its heat map. `experiments/plans/paper.yaml` lists the stages; `plan=search`
+takes those of visual search. A finished run is skipped and a stopped one goes on, so repeat the command until nothing
+is left. `show=table` says how far each run is. `show=commands` prints a command for each run that is left, for a
+cluster's job array. `foajax keep run=<dir>` keeps a run and updates docs/results.md.
 """
 
 from __future__ import annotations

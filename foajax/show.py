@@ -1,13 +1,11 @@
-"""`python -m foajax.show sensor=constant70 points=[[40,40],[60,20]]`: what a sensor sees (Figs. 5, 6).
+"""Draws what a sensor sees of a game's frame: `foajax show sensor=constant70 points=[[40,40],[60,20]]`.
 
-A row for each focal point: the frame with the focal areas drawn on it, what the sensor gives put back in
-its place, and for a packed layout the images themselves, which is all that the network is given. With
-`sensor=all`, every sensor of the paper and the log-polar one on one sheet. Keys of the sensor change it or
-make one's own: `sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`. With `env.color=true`
-it looks at the screen in colour.
+Each focal point gets a row: the frame with the focal area drawn on it, and what the sensor sees, put back in its
+place. A packed sensor's row has its images too, which are all that the network gets. `sensor=all` draws the paper's
+sensors and the log-polar one on one sheet. Keys of the sensor change it:
+`sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`.
 
-Frames are as the emulator draws them, not normalised, so that black is both black and hidden. The
-brightest pixel of the frame is drawn white.
+Frames are not normalised, so black may be a black pixel or a hidden one. The frame's brightest pixel is drawn white.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.compose import compose
+from foajax.config.compose import choices, compose
 from foajax.config.parse import Section, refuse
 from foajax.config.schema import Config, Point
 from foajax.envs.make import make
@@ -32,7 +30,7 @@ from foajax.viewing.sheet import ALL, contact_sheet, draw, save
 class Options(Section):
     """What the command takes besides keys of the sensor."""
 
-    sensor: str = Field("constant70", description="A choice of the group sensor/, or all.")
+    sensor: str = Field("constant70", description="A sensor, as `foajax train --help` lists them, or all.")
     game: str = Field("breakout", description="The game whose frame is shown.")
     points: tuple[Point, ...] = Field((), description="Focal points in frame pixels; none for the frame's centre.")
     out: str = Field("show.png", description="The image, a .png file.")
@@ -44,6 +42,9 @@ class Options(Section):
     def check(self) -> None:
         if not self.out.endswith(".png"):
             raise refuse("out", self.out, "a file name that ends in .png")
+        cli.check_file("out", self.out)
+        if self.sensor not in (known := [*choices()["sensor"], "all"]):
+            raise refuse("sensor", self.sensor, known)
 
 
 def walk(config: Config, steps: int) -> np.ndarray:

@@ -1,20 +1,19 @@
-"""`python -m foajax.status runs/`: what every run below some directories is doing, drawn again every few seconds.
+"""Shows what every run below some directories is doing, as a live table: `foajax status runs/`.
 
-It reads what the runs write and holds nothing, so it may run anywhere that sees their files. The states:
+It only reads the runs' files, so it works on any machine that sees them. The states:
 
     starting   held by a process, nothing logged yet
     running    held by a process, and a row of metrics is not old
     stalled    held by a process that has logged nothing for long
     finished   a checkpoint at or beyond `train.env_steps`
     failed     the last start ended with an error, which is shown
-    stopped    everything else: interrupted or killed; the same command goes on from the newest checkpoint
+    stopped    interrupted or killed; the same command goes on from the newest checkpoint
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ _COLOURS = {"running": "green", "finished": "blue", "failed": "red", "stalled": 
 def table(runs: Sequence[RunStatus]) -> Table:
     """All runs, a row each, and how many are in which state."""
     counts = [f"{sum(r.state == state for r in runs)} {state}" for state in dict.fromkeys(r.state for r in runs)]
-    drawn = Table(title=f"{len(runs)} runs: {', '.join(counts)}" if runs else "no runs yet")
+    drawn = Table(title=f"{len(runs)} run{'s' * (len(runs) != 1)}: {', '.join(counts)}" if runs else "no runs yet")
     drawn.add_column("run", overflow="fold")
     drawn.add_column("state", overflow="fold")
     for column in ("env_steps", "of", "steps/s", "score", "left"):
@@ -57,14 +56,14 @@ def table(runs: Sequence[RunStatus]) -> Table:
 class Options(Section):
     """What the command takes after its directories."""
 
-    every: float = Field(2.0, gt=0, le=86_400, description="Seconds between two pictures.")
-    once: bool = Field(False, description="Print one picture and end, as where the output is no terminal.")
+    every: float = Field(2.0, gt=0, le=86_400, description="Seconds between two updates of the table.")
+    once: bool = Field(False, description="Print the table once and end, as always where the output is no terminal.")
 
 
 def status(arguments: Sequence[str]) -> None:
     """The command."""
-    directories = [word for word in arguments if "=" not in word or os.path.isdir(word)] or ["runs"]
-    options = cli.parse(Options, [word for word in arguments if word not in directories])
+    directories, others = cli.split(arguments)
+    options, directories = cli.parse(Options, others), directories or ["runs"]
     console = Console(highlight=False)
 
     def picture() -> Table:

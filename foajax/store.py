@@ -1,6 +1,7 @@
-"""`python -m foajax.store run=<dir> out=<dir>`: makes of a run an agent to be shipped.
+"""Makes an agent to ship from a run: `foajax store run=<dir> out=<dir>`.
 
-It has parameters and frame statistics only, as one safetensors file, and can be read without this package.
+The agent is one safetensors file of parameters and frame statistics, with its configuration. Other programs can read
+it without this package.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Options(Section):
         "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
     )
     score: str | None = Field(None, description="File that `evaluate json=` has written, to go with the agent.")
-    trust: bool = Field(False, description="Whether code that the run's configuration names may run.")
+    trust: bool = Field(False, description="Let code run that the run's configuration names.")
 
 
 def export(arguments: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""`python -m foajax.train experiment=constant70 game=breakout`: trains one agent, or goes on training it."""
+"""Trains one agent, or goes on training it: `foajax train experiment=constant70 game=breakout`."""
 
 from __future__ import annotations
 

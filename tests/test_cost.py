@@ -120,10 +120,13 @@ def test_the_command(tmp_path, capsys):
 @pytest.mark.parametrize(
     "word, message",
     [
-        ("experiments=constant71", "experiment=constant71: accepted is one of"),
+        ("experiments=nonfoa,constant71", "experiments=constant71: did you mean constant70? accepted is one of"),
         ("repeats=0", "repeats=0: accepted is an integer >= 1"),
         ("torso=resnet", "torso=resnet: accepted is one of nature, a3c"),
-        ("json=/nowhere/at/all.json", "json=/nowhere/at/all.json: accepted is a file, to write, in a directory"),
+        (
+            "json=/nowhere/at/all.json",
+            "json=/nowhere/at/all.json: accepted is a file that can be written, in a directory",
+        ),
     ],
 )
 def test_a_mistake_is_one_line(word, message, capsys):

@@ -57,6 +57,9 @@ def test_an_agent_is_played_by_its_name(shipped, tmp_path, capsys):
     assert capsys.readouterr().out.startswith("poor plays breakout.")
     assert cli.run(demo.demo, ["game=pong", f"agent={shipped / 'poor'}", f"out={tmp_path / 'out'}"]) == 2
     assert "poor plays another; accepted is null or breakout" in capsys.readouterr().err
+    assert cli.run(demo.demo, ["agent=rich"]) == 2
+    said = "agent=rich: does not exist; accepted is the directory of a run or an agent, or one of "
+    assert capsys.readouterr().err.startswith(f"foajax: error: {said}")
 
 
 @pytest.mark.parametrize(("answer", "wanted"), [("y", True), ("Yes", True), ("", False), ("n", False)])
@@ -150,7 +153,10 @@ def test_agents_are_beside_a_checkout():
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("json=nowhere/score.json", "json=nowhere/score.json: accepted is a file, to write, in a directory that"),
+        (
+            "json=nowhere/score.json",
+            "json=nowhere/score.json: accepted is a file that can be written, in a directory that",
+        ),
         ("seed=2147483648", "seed=2147483648: accepted is an integer from 0 to"),
         ("seed=-1", "seed=-1: accepted is an integer from 0 to"),
         ("checkpoint=last", "checkpoint=last: accepted is one of newest, best"),
@@ -165,5 +171,5 @@ def test_an_evaluation_that_cannot_be_is_refused_before_it_plays(shipped, capsys
 def test_help_names_every_key(capsys):
     assert cli.run(demo.demo, ["--help"]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("`python -m foajax.demo`")
+    assert out.startswith("Lets a shipped agent play one game")
     assert "\n  steps=6000  Decisions at most; " in out and "Accepted: an integer >= 1.\n" in out

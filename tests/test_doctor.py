@@ -51,7 +51,9 @@ def test_a_checkout_that_is_not_installed_is_said(monkeypatch, capsys):
 
 def test_it_takes_no_words(capsys):
     assert cli.run(doctor.doctor, ["game=pong"]) == 2
-    assert capsys.readouterr().err.startswith("foajax: error: game=pong: ")
+    assert capsys.readouterr().err == "foajax: error: game=pong: unknown key\n"
+    assert cli.run(doctor.doctor, ["--verbose"]) == 2
+    assert capsys.readouterr().err == "foajax: error: --verbose: the command takes no words\n"
 
 
 def test_every_extra_is_described():

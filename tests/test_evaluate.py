@@ -56,9 +56,12 @@ def test_another_protocol_is_played_and_noted(capsys, tmp_path):
     [
         (
             "env.frame_shape=[84,84]",
-            "env.frame_shape=[84, 84]: cannot be changed; accepted is one of engine, frame_skip,",
+            "env.frame_shape=[84, 84]: cannot be changed; accepted is one of env.engine, env.frame_skip,",
         ),
-        ("env.stickiness=0.25", "env.stickiness=0.25: cannot be changed; accepted is one of engine, frame_skip,"),
+        (
+            "env.stickiness=0.25",
+            "env.stickiness=0.25: unknown key (did you mean env.sticky_actions?); accepted is one of env.e",
+        ),
         ("env.sticky_actions=2", "env.sticky_actions=2.0: accepted is a number in [0, 1)"),
     ],
 )

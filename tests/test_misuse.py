@@ -36,7 +36,7 @@ for line in json.load(sys.stdin):
         said.append(str(error))
 print(json.dumps(said))
 """
-RING = "accepted is a list of at least one [height, width, factor]"
+RING = "accepted is a list of one or more [height, width, factor]"
 MISTAKES = {
     "RingSensor(((8, 8, 1),), layout='Canvas')": "sensor.layout=Canvas: accepted is one of canvas, packed",
     "RingSensor(((8, 8),))": f"sensor.rings=[[8, 8]]: {RING}",

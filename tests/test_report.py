@@ -261,7 +261,8 @@ def test_runs_that_differ_need_names_that_differ(tmp_path):
 @pytest.mark.parametrize(
     "words, message",
     [
-        ([], "no runs: accepted is report"),
+        ([], "no runs: accepted is foajax report runs/<a> "),
+        (["run=runs/a"], "run=runs/a: accepted is runs/a, without run="),
         (["nowhere"], "run=nowhere: does not exist"),
         (["nowhere", "preset=all"], "preset=all: accepted is one of constant, decreasing, peripheral or null"),
         (["nowhere", "episodes=-1"], "episodes=-1: accepted is an integer >= 0"),

@@ -144,9 +144,12 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
 @pytest.mark.parametrize(
     "word, message",
     [
-        ("sensor=constant71", "sensor=constant71: accepted is one of"),
-        ("sensor=rings", "sensor.rings: missing; accepted is sensor.rings=value"),
-        ("sensor.ring=3", "sensor.ring=3: unknown key; accepted is one of rings, kind, peripheral, layout, pooling"),
+        ("sensor=constant71", "sensor=constant71: did you mean constant70? accepted is one of"),
+        ("sensor=rings", "sensor.rings: missing; accepted is sensor.rings=value: rings, inner to outer"),
+        (
+            "sensor.ring=3",
+            "sensor.ring=3: unknown key (did you mean sensor.rings?); accepted is one of rings, kind, peripheral, ",
+        ),
         ("sensor=all sensor.layout=packed", "sensor.layout=packed: accepted is a key of one sensor, without sensor=a"),
         ("points=[[40,80]]", "points=[40, 80]: accepted is [y, x] inside the frame, 80x80"),
         ("points=40", "points=40: accepted is a list of [y, x]"),

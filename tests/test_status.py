@@ -126,6 +126,8 @@ def test_the_command_finds_runs_and_prints_one_table(start, tmp_path, capsys, mo
     assert "2 runs: 2 stopped" in out and "deep/b" in out and "50 %" in out and "score" in out and "3.00" in out
     with pytest.raises(ConfigError, match="nowhere: is no directory; accepted is a directory with runs"):
         command.status(["nowhere"])
+    with pytest.raises(ConfigError, match="run=a: accepted is a, without run="):
+        command.status(["run=a"])
     with pytest.raises(ConfigError, match="every=0.0: accepted is"):
         command.status([".", "every=0"])
     with pytest.raises(ConfigError, match="evry=1: unknown key"):

@@ -154,7 +154,11 @@ def test_a_run_begins_with_the_parameters_of_another(breakout, tmp_path, command
 @pytest.mark.parametrize(
     ("source", "word", "said"),
     [
-        ("nowhere", "seed=1", "run=nowhere: does not exist"),
+        (
+            "nowhere",
+            "seed=1",
+            "train.init_from=nowhere: does not exist; accepted is the directory of a run or an agent, or",
+        ),
         (
             "breakout",
             "network.lstm=8",
@@ -232,8 +236,8 @@ def test_two_processes_do_not_share_a_run(tmp_path, command):
         ("sensor.rings=[[90,90,2]]", "inside env.frame_shape=80x80"),
         ("sensor.rings=[[16,16,40]]", "1 <= factor <= height and width"),
         ("env.num_envs=many", "env.num_envs=many: accepted is an integer"),
-        ("game=no_such_game", "game=no_such_game: accepted is"),
-        ("experiment=constant71", "experiment=constant71: accepted is one of"),
+        ("game=no_such_game", "game=no_such_game: did you mean name_this_game? accepted is"),
+        ("experiment=constant71", "experiment=constant71: did you mean constant70? accepted is one of"),
         ("gaze=none", "gaze.mode=none: accepted is a focal area as large as the frame, 80x80, not 16x16; or"),
     ],
 )

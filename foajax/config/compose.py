@@ -1,4 +1,4 @@
-"""From `key=value` words to a checked `Config`, by way of experiments/ and of a directory of one's own.
+"""Makes a checked `Config` of `key=value` words, with the files of experiments/ and of a directory of one's own.
 
 Hydra and OmegaConf take a third of a second to import, so that is left to the functions that need them.
 """
@@ -6,13 +6,13 @@ Hydra and OmegaConf take a third of a second to import, so that is left to the f
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
 
-from foajax.config.parse import Section, one_line, refuse
+from foajax.config.parse import ABSENT, Section, one_line, refuse, with_sentence
 from foajax.config.schema import (
     RENAMED,
     Config,
@@ -24,13 +24,14 @@ from foajax.config.schema import (
     renamed,
 )
 from foajax.config.shipped import experiments
-from foajax.config.table import defaults
+from foajax.config.table import Key, defaults, groups
 
 _KINDS: dict[str, type[Section]] = {
     "rings": RingSensor,
     "logpolar": LogPolarSensor,
     "own": OwnSensor,
 }  # sensors of one's own, by themselves
+_PLANS = "plans"  # of experiments/; `foajax.reproduce` reads them, they are no group
 _WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave out
 
 
@@ -93,6 +94,8 @@ def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> 
         raise refuse(one_line(word))
     if override.is_hydra_override():
         raise refuse(one_line(word), accepted="the same with --multirun")
+    if key == _PLANS:  # Hydra takes its directory for a group
+        raise refuse(one_line(word), accepted=Config.model_fields, why="unknown key")
     text = override.get_value_string()
     offered = choices(config_dir)
     if override.is_sweep_override():
@@ -127,13 +130,29 @@ def from_node(node: Any, words: Collection[str] = ()) -> Config:
     try:
         stated = {word.lstrip("+").partition("=")[0] for word in words}
         plain = renamed(cast(dict, OmegaConf.to_container(node)), stated)  # before a key follows another
+        _check_kind(plain.get("sensor"), stated)
         node = OmegaConf.create(plain)
         return from_mapping(OmegaConf.to_container(node, resolve=True, throw_on_missing=True))
     except MissingMandatoryValue as error:
-        raise refuse(str(error.full_key), accepted=f"{error.full_key}=value", why="missing") from None
+        sentence = next((key.sentence for key in _keys() if key.name == error.full_key and key.default is ABSENT), "")
+        accepted = with_sentence(f"{error.full_key}=value", sentence)
+        raise refuse(str(error.full_key), accepted=accepted, why="missing") from None
     except OmegaConfBaseException as error:
         accepted = "a value or ${key} with another key's name"
         raise refuse(str(error.full_key), accepted=accepted, why=_first_line(error)) from None
+
+
+def _check_kind(sensor: Any, stated: Collection[str]) -> None:
+    """`ConfigError` where a word gives a sensor another kind and leaves it the keys of its old one."""
+    kind = sensor.get("kind") if isinstance(sensor, dict) else None
+    cls = _KINDS.get(str(kind))
+    if cls is not None and "sensor.kind" in stated and sensor.keys() - cls.model_fields.keys():
+        raise refuse("sensor.kind", kind, f"sensor={kind}, which brings the keys of that kind")
+
+
+def _keys() -> Iterator[Key]:
+    """All keys, in their order."""
+    return (key for group in groups(Config) for key in group.keys)
 
 
 def _first_line(error: Exception) -> str:
@@ -160,6 +179,6 @@ def choices(config_dir: str | Path | None = None) -> dict[str, tuple[str, ...]]:
     found: dict[str, set[str]] = {"sensor": {*_KINDS, *_packed()}, "experiment": {*_rings(), *_packed()}}
     for directory in [experiments()] + ([] if config_dir is None else [Path(config_dir)]):
         for file in directory.glob("*/*.yaml"):
-            if file.parent.name != "plans":  # those are no group: `foajax reproduce` reads them
+            if file.parent.name != _PLANS:
                 found.setdefault(file.parent.name, set()).add(file.stem)
     return {group: tuple(sorted(names)) for group, names in sorted(found.items())}

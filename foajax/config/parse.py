@@ -1,11 +1,13 @@
-"""What every group of keys is: a frozen pydantic model, whose mistakes are one line that names key, value and what is
-accepted. The part that knows of no key.
+"""Groups of keys as frozen pydantic models; a mistake in one is a line with the key, its value and what is accepted.
+
+The keys themselves are in `foajax.config.schema`.
 """
 
 from __future__ import annotations
 
 import difflib
 import functools
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -31,14 +33,23 @@ def refuse(
     """The error, to be raised, about a key's value, or about a word by itself.
 
     `accepted` says in words what the value may be, or is all of its choices: the one nearest to the value, or to
-    `near`, is suggested. `why` says what is wrong where that is not plain.
+    `near`, is suggested before the others are listed. `why` says what is wrong where that is not plain.
     """
     given = key if value is ABSENT else f"{key}={brief(value)}"
     if not isinstance(accepted, str):
         choices = tuple(accepted)
         found = difflib.get_close_matches(str(value) if near is None else near, choices, n=1)
-        accepted = f"one of {', '.join(choices)}" + "".join(f" (did you mean {name}?)" for name in found)
-    return kind(f"{given}: " + "; ".join(filter(None, [why, accepted and f"accepted is {accepted}"])))
+        why = suggest(why, *found)
+        accepted = f"one of {', '.join(choices)}"
+    between = " " if why.endswith("?") else "; "
+    return kind(f"{given}: " + between.join(filter(None, [why, accepted and f"accepted is {accepted}"])))
+
+
+def suggest(why: str, *names: str) -> str:
+    """What is wrong, with the first of the names that may have been meant."""
+    if not names:
+        return why
+    return f"{why} (did you mean {names[0]}?)" if why else f"did you mean {names[0]}?"
 
 
 def one_line(*parts: object) -> str:
@@ -190,7 +201,8 @@ def describe(node: Mapping[str, Any]) -> str:
         case "array" if "prefixItems" in node:
             return f"[{', '.join(map(describe, node['prefixItems']))}]"
         case "array":
-            return f"a list of {'at least one ' if node.get('minItems') else ''}{describe(node.get('items', {}))}"
+            several = re.sub(r"^an? (integer|number|string)\b", r"\1s", describe(node.get("items", {})))
+            return f"a list of {'one or more ' if node.get('minItems') else ''}{several}"
         case "object" if isinstance(node.get("additionalProperties"), Mapping) and "properties" not in node:
             return f"a mapping to {describe(node['additionalProperties'])}"
         case "integer" | "number" as kind:
@@ -206,7 +218,7 @@ def _describe_number(node: Mapping[str, Any], *, is_integer: bool) -> str:
     least, above = node.get("minimum"), node.get("exclusiveMinimum")
     most, below = node.get("maximum"), node.get("exclusiveMaximum")
     if least is above is most is below is None:
-        return name if is_integer else f"{name} (0, or of 1e-37 to 1e38)"
+        return name
     ends = (above if least is None else least, below if most is None else most)
     low, high = (str(end) if is_integer or end is None else f"{end:g}" for end in ends)
     if most is below is None:
@@ -227,12 +239,41 @@ def _refused(error: ValidationError, cls: type[Section], data: Mapping[str, Any]
     if isinstance(cause, ConfigError):
         return ConfigError(f"{prefix}{cause}")
     if first["type"] == "extra_forbidden":
-        return refuse(name, value, around["properties"], why="unknown key", near=str(keys[-1]))
+        known = around["properties"]
+        why = suggest("unknown key", *_nearest(str(keys[-1]), prefix.removesuffix(f"{keys[-1]}."), known, root))
+        return refuse(name, value, f"one of {', '.join(known)}" if known else "", why=why)
     if value is ABSENT:
-        return refuse(name, accepted=describe(node), why="missing")
+        return refuse(name, accepted=with_sentence(describe(node), node.get("description", "")), why="missing")
     if first["type"] == "union_tag_invalid":
         return refuse(f"{name}.kind", value.get("kind"), kinds(node, root))
     return refuse(name, value, str(cause or "") or describe(node))
+
+
+def with_sentence(accepted: str, sentence: str) -> str:
+    """What a key accepts, with its sentence, for who has not given it."""
+    return f"{accepted}: {sentence[:1].lower()}{sentence[1:].removesuffix('.')}" if sentence else accepted
+
+
+def _nearest(word: str, prefix: str, known: Iterable[str], root: Mapping[str, Any]) -> list[str]:
+    """The key that a word may stand for: the most similar one, if it is in the same section or very similar."""
+    places = {name: f"{prefix}{name}" for name in known}
+    elsewhere = {dotted.rpartition(".")[2]: dotted for dotted in reversed(list(_dotted(root, root)))}
+    for name in difflib.get_close_matches(word, {**elsewhere, **places}):
+        if name in places:
+            return [places[name]]
+        if difflib.get_close_matches(word, [name], cutoff=0.8):
+            return [elsewhere[name]]
+    return []
+
+
+def _dotted(node: Mapping[str, Any], root: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """The dotted keys of a schema, those of sections with kinds left out."""
+    for word, child in node.get("properties", {}).items():
+        child = resolve(child, root)
+        if "properties" in child:
+            yield from _dotted(child, root, f"{prefix}{word}.")
+        else:
+            yield f"{prefix}{word}"
 
 
 def _find(

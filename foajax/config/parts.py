@@ -1,4 +1,4 @@
-"""Parts that a configuration names: by a word of ours, or as `package.module:Name` of code from elsewhere."""
+"""Finds the parts that a configuration names: one of the package's own, or `package.module:Name` of the user's."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def bind_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **
     try:
         inspect.signature(make).bind(**arguments)
     except TypeError as error:
-        raise refuse(key, name, f"a call with {inspect.signature(make)} ({error})") from None
+        names = [word for word in inspect.signature(make).parameters if word not in ("parent", "name")]  # Flax's own
+        raise refuse(key, name, f"arguments {', '.join(names) or 'none'}", why=one_line(error)) from None
     return functools.partial(make, **arguments)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 
-from foajax.config.parse import refuse
+from foajax.config.parse import refuse, suggest
 from foajax.config.schema import Config, game_name
 from foajax.envs.own import OWN
 from foajax.types import SCREEN_SHAPE
@@ -34,16 +34,15 @@ def atari_name(game: str, known: Iterable[str]) -> str:
     """The snake-case name, e.g. beam_rider, of a game given by a name of any library's: BeamRider-v5, beamrider.
 
     Raises:
-      ConfigError: if `known` does not have it; the message has the nearest names.
+      ConfigError: if `known` does not have it; the message has the nearest name.
     """
     names = {name.replace("_", ""): name for name in known}
     plain = game_name(game).replace("_", "")
     if plain in names:
         return names[plain]
-    near = difflib.get_close_matches(game_name(game), [*names.values(), *OWN], n=3)
-    hint = f"; near: {', '.join(near)}" if near else ""
+    near = difflib.get_close_matches(game_name(game), [*names.values(), *OWN], n=1)
     others = f"{', '.join(OWN)}, gymnasium:<id> or package.module:factory"
-    raise refuse("game", game, f"an Atari game (breakout), {others}{hint}")
+    raise refuse("game", game, f"an Atari game such as breakout, {others}", why=suggest("", *near))
 
 
 def envpool_id(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Letters for search tasks: small bitmaps that say what they are at full resolution alone.
+"""Letters for search tasks: small bitmaps that can be told apart only at full resolution.
 
 A letter is the mask of a glyph of DejaVu Sans Bold, 11 pixels high, filled with a checkerboard of single pixels, on a
 plate of even gray. Any mean over a block of even sides sees the plate; of the letter it sees only the corners of its

@@ -51,7 +51,7 @@ class GymnasiumEnvironment:
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
             accepted = "the id of an environment, or gymnasium:<module>:<id> with the module that registers it"
             missing = getattr(error.__cause__ or error, "name", None) if isinstance(error, ImportError) else None
-            why = f"{missing} is missing (pip install {missing})" if missing else one_line(error)
+            why = f"{missing} is missing (pip install {missing})" if missing else one_line(error).rstrip(".")
             raise refuse("game", config.game, accepted, why=why) from None
         observations, actions = self._env.single_observation_space, self._env.single_action_space
         color = config.env.color

@@ -1,4 +1,4 @@
-"""Which environment plays a game, and what is known of it before it is made."""
+"""Makes the environment that plays a game, and tells what is known of a game before that."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Probe environments: tiny tasks whose values are known exactly, each made to fail alone.
+"""Probe environments: tiny tasks with exactly known values, each of which tests one part of the agent.
 
 An agent that cannot learn `constant` has a broken value loss; `observation`, broken inputs; `delay`,
 broken discounting; `action`, a broken policy gradient; `match`, both together; `memory`, a broken

@@ -1,4 +1,4 @@
-"""Search: a scene of letters, one of which has to be found, because what is asked shows only from close up.
+"""Visual search: the agent has to find one letter of a scene and look at it closely to answer.
 
 A scene is static. It has a number of letters on plates (`foajax.envs.glyphs`), one to a cell of 20 pixels, cells drawn
 without replacement, and each somewhere in its cell. One of them is the target: with `search.target=letter`, the one T

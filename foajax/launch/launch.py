@@ -1,4 +1,4 @@
-"""From a command line to runs: one, or the runs of a sweep."""
+"""Starts the run, or the runs of a sweep, that a command line describes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from foajax import cli
 from foajax.config import table
 from foajax.config.compose import checked, choices, compose, from_node, register
-from foajax.config.parse import one_line, refuse
+from foajax.config.parse import one_line, refuse, suggest
 from foajax.config.schema import RENAMED, Config
 from foajax.config.shipped import experiments
 from foajax.launch import sweep
@@ -20,7 +20,7 @@ from foajax.runs.directory import is_run
 from foajax.runs.status import is_finished
 
 Task = Callable[[Config], int | None]  # returns an exit code, None for 0
-_HELP = """Trains one agent: python -m foajax.train [key=value ...]
+_HELP = """Trains one agent, or goes on training it: foajax train [key=value ...]
 
 Groups (group=choice), with more of your own from --config-dir=DIR:
 {groups}
@@ -31,6 +31,19 @@ Keys (key=value), with their defaults:
 Flags: --multirun runs every combination of key=a,b,c, with --jobs=N so many at a time; --cfg job prints the keys of a
 run."""
 _MULTIRUN = {"-m", "--multirun"}
+_FLAGS = (
+    *_MULTIRUN,
+    "--jobs",
+    "-c",
+    "--cfg",
+    "-p",
+    "--package",
+    "--resolve",
+    "-i",
+    "--info",
+    "--hydra-help",
+    "--version",
+)
 
 
 def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None] = lambda config: None) -> int:
@@ -50,6 +63,7 @@ def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None]
 
 def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) -> int | None:
     directory, arguments = _take_directory(arguments)
+    _check_flags(arguments)
     _name_new_words(arguments)
     if not any(word.startswith("-") for word in arguments):
         with interrupt_ends():
@@ -91,6 +105,23 @@ def _take_directory(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
                 raise refuse(f"{flag}={value}", accepted="a directory with experiment/, sensor/, network/, learner/")
             return directory, words[:i] + words[end:]
     return None, words
+
+
+def _check_flags(arguments: Sequence[str]) -> None:
+    """`ConfigError` where a word begins with a dash and is no flag of ours, nor one of Hydra's that make sense here."""
+    for i, word in enumerate(arguments):
+        flag, is_joined, value = word.partition("=")
+        if flag.startswith("-") and flag not in _FLAGS:
+            is_key = is_joined and flag.strip("-").partition(".")[0] in (*choices(), *Config.model_fields)
+            why = suggest("is no flag", *([word.lstrip("-")] if is_key else ()))
+            accepted = "key=value, --multirun, --jobs=N, --config-dir=DIR or --cfg job"
+            raise refuse(one_line(word), accepted=accepted, why=why)
+        if flag in ("-c", "--cfg"):
+            what = value if is_joined else "".join(arguments[i + 1 : i + 2])
+            if what not in ("job", "hydra", "all"):
+                raise refuse(flag, what, ("job", "hydra", "all"))
+        if flag in _MULTIRUN and is_joined:
+            raise refuse(one_line(word), accepted=f"{flag} alone")
 
 
 def _name_new_words(arguments: Sequence[str]) -> None:

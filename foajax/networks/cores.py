@@ -1,4 +1,4 @@
-"""Cores: what is remembered from step to step. A new one is a Flax module with the two methods of `Core`."""
+"""Cores, the network's memory from step to step. A new one is a Flax module with the two methods of `Core`."""
 
 from __future__ import annotations
 

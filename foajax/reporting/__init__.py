@@ -1,1 +1,1 @@
-"""What runs add up to: scores, curves, costs, and the report of them."""
+"""Scores, curves and costs of runs, and the report of them."""

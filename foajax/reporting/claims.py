@@ -1,4 +1,4 @@
-"""The paper's claims, and questions of ours, asked of kept runs: what is seen, and whether it holds.
+"""Tests the paper's claims, and some of our own, on kept runs: the numbers, and a verdict.
 
 Each claim says within which bounds a number has to lie: a ratio of two scores, or a share. `judge` has the rules, and
 `RULES` says them in words.

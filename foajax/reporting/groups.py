@@ -1,4 +1,4 @@
-"""Runs by game and experiment: what is a seed of what, how they differ, what they score."""
+"""Groups runs by game and experiment into seeds; says how groups differ and what they score."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
         if preset is None or base in PRESETS[preset]:
             games.setdefault(run.config.game, {}).setdefault(_label(run.config.name, preset), []).append(run)
     if not games:
-        raise refuse("preset", preset, f"runs of {', '.join(PRESETS[str(preset)])}")
+        raise refuse("preset", preset, f"runs of {', '.join(PRESETS[str(preset)])}", why="leaves no run")
     for groups in games.values():
         for name, seeds in groups.items():
             if differences := differing_keys(seeds):

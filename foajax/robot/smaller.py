@@ -1,4 +1,4 @@
-"""Smaller weights for an exported network."""
+"""Stores the weights of an exported network in fewer bits."""
 
 from __future__ import annotations
 

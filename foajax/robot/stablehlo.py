@@ -47,7 +47,7 @@ def serialise(stored: TrainedAgent) -> bytes:
     try:
         return bytes(export.export(call, platforms=PLATFORMS)(given).serialize())
     except ImportError as error:
-        raise refuse("stablehlo", True, "foajax[robot]", why=f"{error.name} is missing") from None
+        raise refuse("stablehlo", True, "", why=f"{error.name} is missing (pip install 'foajax[robot]')") from None
 
 
 def inputs(agent: Agent, batch: int) -> Arrays:

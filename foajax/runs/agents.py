@@ -137,6 +137,18 @@ def find(path: str | Path) -> Path:
     return shipped if not (path / "config.yaml").exists() and (shipped / "config.yaml").exists() else path
 
 
+def find_config(path: str | Path, key: str = "run") -> Config:
+    """The configuration of the run or the agent that `key` names.
+
+    Raises:
+      ConfigError: there is none, which says what is shipped; or it cannot be read.
+    """
+    shipped = sorted(file.parent.name for file in agents().glob("*/config.yaml"))
+    return load_config(
+        find(path), key=key, accepted=f"the directory of a run or an agent, or one of {', '.join(shipped)}"
+    )
+
+
 def check_trust(path: Path, config: Config, trust: bool) -> None:
     """`ConfigError` where a configuration from disk names code, which would run, and the user has not said so."""
     if config.code and not trust:
@@ -144,19 +156,19 @@ def check_trust(path: Path, config: Config, trust: bool) -> None:
         raise ConfigError(f"run={path}: it would run code, {', '.join(config.code)}; accepted is {accepted}")
 
 
-def load_agent(path: str | Path, *, best: bool = False, trust: bool = False) -> TrainedAgent:
+def load_agent(path: str | Path, *, best: bool = False, trust: bool = False, key: str = "run") -> TrainedAgent:
     """Reads a trained agent.
 
     Args:
       path: a directory of a run or an agent, or the name of a shipped agent, e.g. `pong-constant70_packed`.
       best: of a run, read the checkpoint with the best score in training, not the newest.
       trust: whether code that the agent's configuration names (`package.module:Name`) may run.
+      key: the key that named it, for the message where there is none.
 
     Raises:
       ConfigError: there is no agent, it cannot be read, or it names code and `trust` is false.
     """
-    path = find(path)
-    config = load_config(path)
+    config, path = find_config(path, key), find(path)
     check_trust(path, config, trust)
     try:
         facts = json.loads((path / FACTS).read_text())
@@ -179,10 +191,7 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False) -> 
 
 def check_source(path: str) -> None:
     """`ConfigError`, about `train.init_from`, where `path` is neither a run nor an agent."""
-    try:
-        load_config(find(path))
-    except ConfigError as error:
-        raise refuse("train.init_from", path, "", why=str(error)) from None
+    find_config(path, "train.init_from")
 
 
 def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
@@ -193,7 +202,7 @@ def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
     """
     key = f"train.init_from={path}"
     try:
-        there = load_config(find(path)).code
+        there = find_config(path).code
         stored = load_agent(path, trust=set(there) <= set(config.code))  # what this run's own words name is trusted
     except ConfigError as error:
         raise refuse(key, accepted="", why=str(error)) from None

@@ -1,4 +1,4 @@
-"""A run's directory: held by one process at a time, and for one meaning of the configuration.
+"""A run's directory: one process at a time holds it, and its configuration keeps its meaning.
 
     config.yaml   the resolved configuration
     run.json      every start: command, versions, commit, machine, devices, time
@@ -119,8 +119,13 @@ def take_over(path: Path) -> RunDir | None:
         return None
 
 
-def load_config(path: str | os.PathLike[str]) -> Config:
+def load_config(path: str | os.PathLike[str], *, key: str = "run", accepted: str = "the directory of a run") -> Config:
     """The configuration of the run in `path`, with ``run`` set to `path`.
+
+    Args:
+      path: its directory.
+      key: the key that named it, for the message where there is none.
+      accepted: what that key accepts.
 
     Raises:
       RunError: there is no such directory, it is no run, or its ``config.yaml`` cannot be read.
@@ -138,7 +143,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     except (FileNotFoundError, NotADirectoryError):
         there = f"has no {_CONFIG}" if os.path.isdir(path) else "is a file"
         what = there if os.path.exists(path) else "does not exist"
-        raise refuse("run", path, "the directory of a run", why=what, kind=RunError) from None
+        raise refuse(key, path, accepted, why=what, kind=RunError) from None
     except ConfigError as error:
         raise refuse(str(file), accepted="", why=str(error), kind=RunError) from None
     except OSError as error:

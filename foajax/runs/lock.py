@@ -1,4 +1,4 @@
-"""A run's directory is held by one process at a time: the kernel's lock."""
+"""The kernel's lock by which one process at a time holds a run's directory."""
 
 from __future__ import annotations
 

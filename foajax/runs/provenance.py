@@ -1,4 +1,4 @@
-"""``run.json``: what every start of a run was made with."""
+"""``run.json`` records with what command, code and machine each start of a run was made."""
 
 from __future__ import annotations
 

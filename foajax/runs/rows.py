@@ -1,4 +1,4 @@
-"""Rows of ``metrics.jsonl``, as others read them."""
+"""Reads the rows of ``metrics.jsonl``."""
 
 from __future__ import annotations
 

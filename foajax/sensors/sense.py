@@ -1,4 +1,4 @@
-"""One frame and a focal point in, what is seen out: the function in front of every sensor.
+"""Turns one frame and a focal point into what a sensor sees, for every kind of sensor.
 
 It is for one frame; the caller vmaps and jits. The cost depends on the sensor, not on the frame, except
 where every pixel of the frame matters: a canvas, a peripheral grid of means.

@@ -240,5 +240,5 @@ class Run:
         if stop is None:
             return f"done: {self.progress.env_steps:,} env_steps"
         if not self.progress.env_steps:
-            return f"{stop}: before anything was learned; the same command begins anew"
+            return f"{stop}: stopped before anything was learned; the same command begins anew"
         return f"{stop}: saved at {self.progress.env_steps:,} env_steps; the same command goes on from here"

@@ -12,9 +12,12 @@ from foajax.envs.atari import check_game
 from foajax.envs.make import make_environments
 from foajax.launch import processes
 from foajax.launch.signals import StopRequest
+from foajax.networks.cores import make_core
+from foajax.networks.torsos import make_torso
 from foajax.runs.agents import TrainedAgent, check_source, load_agent
-from foajax.runs.directory import is_run, open_run
+from foajax.runs.directory import open_run
 from foajax.runs.row_logger import find_logger
+from foajax.runs.status import newest_checkpoint
 from foajax.runtime import use_compilation_cache
 from foajax.sensors.registry import make_sensor
 from foajax.training import profiling
@@ -25,8 +28,8 @@ def check(config: Config) -> None:
     """Finds mistakes that a configuration does not show by itself; of a sweep, in all runs before the first one.
 
     Raises:
-      ConfigError: no gaze and a focal area that is not the whole frame; no such game; no such logger; no
-        agent to begin with.
+      ConfigError: no gaze and a focal area that is not the whole frame; no such game, torso, core or
+        logger; no agent to begin with.
     """
     window, frame = make_sensor(config.sensor).window, config.env.frame_shape
     check_window(config, window)
@@ -35,7 +38,11 @@ def check(config: Config) -> None:
         raise refuse("gaze.mode", "none", f"a focal area {sizes}; or learned, frozen, random, scripted")
     check_game(config)
     find_logger(config)
-    if config.train.init_from is not None and not is_run(Path(config.run_dir)):  # one that goes on does not need it
+    make_torso(config.network)
+    make_core(config.network)
+    if config.train.init_from is not None and not newest_checkpoint(
+        Path(config.run_dir)
+    ):  # one that goes on does not need it
         check_source(config.train.init_from)
 
 

@@ -1,4 +1,4 @@
-"""Ends a run whose environments raise or hang, and one that is asked to stop but cannot listen.
+"""Ends a run whose environments raise or hang, and one that is asked to stop while it is blocked.
 
 A call that never returns holds the main thread for good, and no signal handler of Python runs there. So a
 thread of its own watches: it knows which call of an environment the main thread is in, and hears of signals

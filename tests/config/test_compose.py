@@ -175,14 +175,19 @@ def test_a_mapping_takes_new_keys_and_a_later_word_wins():
     ("override", "fragments"),
     [
         ("experiment=foo", ["experiment=foo: accepted is one of constant50_sub1, ", "nonfoa"]),
-        ("experiment=constnt70", ["experiment=constnt70", "(did you mean constant70?)"]),
+        ("experiment=constnt70", ["experiment=constnt70", "did you mean constant70? accepted is one of"]),
         ("experiment=a/b", ["experiment=a/b: accepted is one of"]),
         ("experiment=", ["experiment=: accepted is one of"]),
-        ("gaze=null", ["gaze=null: accepted is one of frozen, learned, none, random, scripted"]),
-        ("gaze=[frozen]", ["gaze=[frozen]: accepted is one of"]),
-        ("gaze={mode: frozen}", ["gaze={mode: frozen}: accepted is one of"]),
-        ("learner.gama=0.9", ["learner.gama=0.9: unknown key; accepted is one of rollout_length, "]),
-        ("gama=0.9", ["gama=0.9: unknown key; accepted is one of name, "]),
+        ("gaze=null", ["gaze=null: did you mean none? accepted is one of frozen, learned, none, random, scripted"]),
+        ("gaze=[frozen]", ["gaze=[frozen]: did you mean frozen? accepted is one of"]),
+        ("gaze={mode: frozen}", ["gaze={mode: frozen}: "]),
+        (
+            "learner.gama=0.9",
+            ["learner.gama=0.9: unknown key (did you mean learner.natural.gamma?); accepted is one of r"],
+        ),
+        ("gama=0.9", ["gama=0.9: unknown key (did you mean learner.natural.gamma?); accepted is one of name, "]),
+        ("plans=paper", ["plans=paper: unknown key; accepted is one of name, "]),  # of reproduce alone
+        ("sensor.kind=logpolar", ["sensor.kind=logpolar: accepted is sensor=logpolar, which brings the keys of"]),
         ("foo/bar=1", ["foo/bar=1: unknown key"]),
         ("game.speed=2", ["game={'speed': 2}: accepted is a name"]),
         ("learner.natural=3", ["learner.", "natural", "accepted is"]),
@@ -243,6 +248,25 @@ def test_a_single_run_starts_directly_and_leaves_nothing_of_its_own(cwd, runs):
     assert list(cwd.iterdir()) == []
     assert run(runs.record, ["seed=3"]) == 3
     assert run(lambda config: None, []) == 0
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (
+            ["--experiment=nonfoa"],
+            "--experiment=nonfoa: is no flag (did you mean experiment=nonfoa?); accepted is key=",
+        ),
+        (["-x", "seed=1"], "-x: is no flag; accepted is key=value, --multirun, "),
+        (["--config-name=mine"], "--config-name=mine: is no flag; accepted is key=value, --multirun, "),
+        (["--cfg"], "--cfg='': accepted is one of job, hydra, all"),
+        (["--cfg", "jobs"], "--cfg=jobs: did you mean job? accepted is one of job, hydra, all"),
+        (["--multirun=yes", "seed=1"], "--multirun=yes: accepted is --multirun alone"),
+    ],
+)
+def test_a_flag_that_is_not_there_is_refused(cwd, runs, capsys, words, said):
+    assert run(runs.record, words) == 2 and runs == []
+    assert capsys.readouterr().err.startswith(f"foajax: error: {said}")
 
 
 @pytest.mark.parametrize(
@@ -427,7 +451,7 @@ def test_choices_of_ones_own_stand_beside_ours(own):
     config = compose(["experiment=mine", "gaze=fast"], own)
     assert (config.name, config.sensor) == ("mine", composed("experiment=decreasing_packed").sensor)
     assert config.gaze.step == 16 and compose(["sensor=small"], own).sensor.window == (8, 8)
-    with pytest.raises(ConfigError, match="experiment=mien: accepted is one of .*mine.*did you mean mine"):
+    with pytest.raises(ConfigError, match="experiment=mien: did you mean mine. accepted is one of .*mine"):
         compose(["experiment=mien"], own)
     with pytest.raises(ConfigError, match="experiment=mine: accepted is one of"):
         compose(["experiment=mine"])

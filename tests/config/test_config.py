@@ -292,9 +292,19 @@ def test_a_section_takes_its_first_keys_by_place():
         GazeConfig("learned", 5, 4, "point", "centre", (), "steps", (5, 5), 0.0, "pixel", 7)
 
 
-@pytest.mark.parametrize("near, word", [("learner.num_epoch", "num_epochs"), ("sed", "seed"), ("gaze.moode", "mode")])
+NEAREST = [
+    ("learner.num_epoch", "learner.num_epochs"),
+    ("sed", "seed"),
+    ("gaze.moode", "gaze.mode"),
+    ("frame_skip", "env.frame_skip"),  # without its section
+    ("learner.gamma", "learner.natural.gamma"),
+]
+
+
+@pytest.mark.parametrize("near, word", NEAREST)
 def test_the_nearest_key_is_suggested(near, word):
-    assert error(changed(RINGS, near.split("."), 1)).endswith(f" (did you mean {word}?)")
+    said = error(changed(RINGS, near.split("."), 1))
+    assert said.startswith(f"{near}=1: unknown key (did you mean {word}?); accepted is one of ")
 
 
 @pytest.mark.parametrize("key", [key for group in groups(Config) for key in group.keys], ids=lambda key: key.name)

@@ -62,7 +62,7 @@ def test_a_gymnasium_environments_constructor_gets_its_arguments():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["game=test_own:seek_of", "env.kwargs.color=1"], "game=test_own:seek_of: accepted is a call with"),
+        (["game=test_own:seek_of", "env.kwargs.color=1"], "game=test_own:seek_of: got an unexpected keyword"),
         (["game=test_own:no"], "game=test_own:no: accepted is package.module:Name"),
         (["game=test_own:nothing"], "game=test_own:nothing: accepted is what makes all of a foajax.envs.base.Env"),
         (["game=gymnasium:foajax-shades-v0", "env.kwargs.x=1"], "'x'.*accepted is the id of an environment"),

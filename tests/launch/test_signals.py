@@ -65,4 +65,4 @@ def test_a_request_to_stop_does_not_wait_for_a_compilation(tmp_path, monkeypatch
     begin = time.monotonic()
     out, _ = process.communicate(timeout=60)
     assert process.returncode == 0 and time.monotonic() - begin < 10
-    assert "SIGTERM: before anything was learned" in out and not list(tmp_path.glob("run/checkpoints/*"))
+    assert "SIGTERM: stopped before anything was learned" in out and not list(tmp_path.glob("run/checkpoints/*"))

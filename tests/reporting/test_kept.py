@@ -9,6 +9,7 @@ import shlex
 import numpy as np
 import pytest
 
+from foajax import cli, keep
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, flatten, to_mapping
 from foajax.reporting import kept
@@ -93,6 +94,11 @@ def test_a_gaze_without_a_heat_map_of_the_final_policy_is_refused(run):
         ConfigError, match="has no heat map of its final policy in render/; accepted is what render run="
     ):
         kept.keep(run, None)
+
+
+def test_a_name_without_a_run_is_refused_before_tables_are_made(run, capsys):
+    assert cli.run(keep.keep, ["name=mine"]) == 2
+    assert capsys.readouterr().err.startswith("foajax: error: name=mine: accepted is null, or a name beside run=<dir>")
 
 
 def test_numbers_are_kept_to_five_digits(run):

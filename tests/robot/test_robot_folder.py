@@ -209,7 +209,7 @@ def test_a_directory_that_cannot_be_written_is_one_line(make_stored, tmp_path, m
 def test_what_is_not_installed_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert cli.run(export.export, ["run=agents/pong-nonfoa", "out=robot"]) == 2
-    assert "accepted is foajax[robot]" in capsys.readouterr().err
+    assert "is missing (pip install 'foajax[robot]')" in capsys.readouterr().err
 
 
 def test_a_sensor_from_elsewhere_is_refused(make_stored, tmp_path, monkeypatch):

@@ -46,4 +46,4 @@ def test_other_frames_and_missing_packages_are_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "foajax.robot.latency", None)
     monkeypatch.delattr("foajax.robot.latency", raising=False)
     assert cli.run(cost.cost, ["target=onnx", "experiments=nonfoa"]) == 2
-    assert "accepted is foajax[robot]" in capsys.readouterr().err
+    assert "is missing (pip install 'foajax[robot]')" in capsys.readouterr().err

@@ -71,8 +71,8 @@ def test_what_it_raises_is_one_warning(tmp_path, capsys, fails):
     [
         (["train.logger=no_such_module:Log"], "train.logger=no_such_module:Log: accepted is package.module:Name"),
         ([f"{HERE}:Nothing"], "train.logger=test_row_logger:Nothing: accepted is package.module:Name"),
-        ([f"{HERE}:Rows", "train.logger_kwargs.fail=[]"], r"accepted is a call with \(config, fails=\(\)\)"),
-        ([f"{HERE}:seek"], "test_row_logger:seek: accepted is a call with"),
+        ([f"{HERE}:Rows", "train.logger_kwargs.fail=[]"], "'fail'; accepted is arguments config, fails"),
+        ([f"{HERE}:seek"], "test_row_logger:seek: .*; accepted is arguments "),
         (["train.logger=pathlib:Path"], r"pathlib:Path: accepted is a class with log\(row, env_steps\) and close"),
     ],
 )
@@ -123,7 +123,9 @@ def test_weights_and_biases_gets_the_configuration_and_the_rows(wandb, tmp_path)
 
 
 def test_what_weights_and_biases_does_not_take_is_refused(wandb):
-    with pytest.raises(ConfigError, match=r"logger_kwargs.projct=x: wandb.init has no such; .*did you mean project\?"):
+    with pytest.raises(
+        ConfigError, match=r"logger_kwargs.projct=x: wandb.init has no such \(did you mean project\?\); accepted"
+    ):
         find_logger(seek("train.logger=wandb", "train.logger_kwargs.projct=x"))
 
 

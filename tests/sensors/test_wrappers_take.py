@@ -105,11 +105,11 @@ def test_a_vector_of_dicts_is_seen_too():
     "space, options, message",
     [
         (spaces.Dict(BOTH), {}, r"^image_key=None: accepted is one of camera, joints, task$"),
-        (spaces.Dict(BOTH), {"image_key": "camra"}, r"^image_key=camra: .*\(did you mean camera\?\)$"),
+        (spaces.Dict(BOTH), {"image_key": "camra"}, r"^image_key=camra: did you mean camera\? accepted is one of "),
         (spaces.Dict(BOTH), {"image_key": "joints"}, r"^observation_space=.*accepted is a Box of"),
         (None, {"image_key": "camera"}, "^image_key=camera: accepted is none where the observation is no Dict"),
         (spaces.Dict({"x": BOTH["camera"], "image": BOTH["joints"]}), {"image_key": "x"}, "^observation_space=image: "),
-        (None, {"dtype": np.float64}, r"^dtype=float64: accepted is one of float32, uint8"),
+        (None, {"dtype": np.float64}, r"^dtype=float64: did you mean float32\? accepted is one of float32, uint8"),
         (spaces.Box(-1, 1, (16, 20)), {"dtype": np.uint8}, r"^dtype=uint8: accepted is numpy.float32 where"),
         (None, {"actions": "multidiscrete", "action_space": spaces.Box(-1, 1, (2,))}, "^actions=.*dict or tuple where"),
     ],
