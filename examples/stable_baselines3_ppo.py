@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.atari_wrappers import AtariWrapper
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
@@ -26,20 +27,17 @@ import foajax
 gymnasium.register_envs(ale_py)
 
 
-def make(game: str, sensor: str) -> gymnasium.Env:
-    """An Atari game, the last four frames of it and clipped rewards, through a sensor."""
-    env = gymnasium.make(game, frameskip=1, repeat_action_probability=0.0)
-    env = gymnasium.wrappers.AtariPreprocessing(env, frame_skip=4)
-    env = gymnasium.wrappers.FrameStackObservation(env, 4)  # PPO has no memory
-    env = gymnasium.wrappers.TransformReward(env, np.sign)
+def see(env: gymnasium.Env, sensor: str) -> gymnasium.Env:
+    """The last four frames of an Atari game, through a sensor. Lives are episodes and rewards are signs."""
+    env = gymnasium.wrappers.FrameStackObservation(AtariWrapper(env), 4)  # PPO has no memory
     return foajax.FoveatedObservation(env, sensor, dtype=np.uint8, actions="multidiscrete")
 
 
 class Features(BaseFeaturesExtractor):
-    """Two small convolutions for each image, and the focal point beside them."""
+    """Two small convolutions for each image, and a dense layer that has the focal point too."""
 
     def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
-        super().__init__(observation_space, features_dim=1)
+        super().__init__(observation_space, features_dim=256)
         self.images = nn.ModuleDict()
         width = 2  # of the focal point
         for name, space in observation_space.items():
@@ -49,16 +47,18 @@ class Features(BaseFeaturesExtractor):
             self.images[name] = nn.Sequential(*layers)
             with torch.no_grad():
                 width += self.images[name](torch.zeros(1, *space.shape)).shape[1]
-        self._features_dim = width
+        self.dense = nn.Sequential(nn.Linear(width, self.features_dim), nn.ReLU())
 
     def forward(self, observation: dict[str, torch.Tensor]) -> torch.Tensor:
         parts = [network(observation[name]) for name, network in self.images.items()]
-        return torch.cat([*parts, observation["focal_point"]], dim=1)
+        return self.dense(torch.cat([*parts, observation["focal_point"]], dim=1))
 
 
 def train(game: str, sensor: str, steps: int, num_envs: int, seed: int = 0) -> PPO:
     """A trained model; `steps` are those of all environments together."""
-    envs = make_vec_env(make, num_envs, seed=seed, env_kwargs={"game": game, "sensor": sensor})
+    emulator = {"frameskip": 1, "repeat_action_probability": 0.0}
+    kwargs = {"env_kwargs": emulator, "wrapper_class": see, "wrapper_kwargs": {"sensor": sensor}}
+    envs = make_vec_env(game, num_envs, seed=seed, **kwargs)  # scores are of whole games, from before the wrapper
     model = PPO(
         "MultiInputPolicy",
         envs,
@@ -68,7 +68,7 @@ def train(game: str, sensor: str, steps: int, num_envs: int, seed: int = 0) -> P
         clip_range=0.1,
         ent_coef=0.01,
         learning_rate=2.5e-4,
-        policy_kwargs={"features_extractor_class": Features},
+        policy_kwargs={"features_extractor_class": Features, "net_arch": []},
         seed=seed,
         verbose=1,
     )
