@@ -2,19 +2,14 @@
 
     python benchmarks/foveation.py [out=results.json]
 
-Prints medians over one run, with the device and the versions. Frames are float32 and already in the
-device's memory, results stay there; what is compared is timed in turns, so that both see the same
-machine. Run it on an idle one.
+Prints medians over one run, and the device. Frames are float32 and already in the device's memory, results stay
+there; what is compared is timed in turns, so that both see the same machine. Run it on an idle one.
 """
 
 from __future__ import annotations
 
 import functools
-import os
-import platform
-import statistics
 import sys
-import time
 from collections.abc import Callable, Sequence
 
 import jax
@@ -24,12 +19,13 @@ import numpy as np
 from foajax import cli, runtime
 from foajax.config.compose import compose
 from foajax.config.schema import LogPolarSensor, RingSensor, SensorConfig
-from foajax.reporting import bench
+from foajax.reporting import bench, cost
 from foajax.sensors.sense import sense
 from foajax.viewing.sheet import PAPER
 
 TABLE_II = {name: compose([f"experiment={name}"]).sensor for name in PAPER}
 CONSTANT70_PACKED = RingSensor(((70, 70, 2),), layout="packed")
+REPEATS = 200
 
 
 def sensors() -> dict[str, SensorConfig]:
@@ -39,20 +35,6 @@ def sensors() -> dict[str, SensorConfig]:
     }
     logpolar = {f"logpolar {s}": LogPolarSensor(sampling=s) for s in ("area", "bilinear")}
     return {**{f"{name} canvas": s for name, s in TABLE_II.items()}, **packed, **logpolar}
-
-
-def median_times(functions: Sequence[Callable[[], object]], seconds: float = 1.0) -> list[float]:
-    """Median duration of each call in microseconds, called in turns for about `seconds` each."""
-    for function in functions:  # compile
-        jax.block_until_ready(function())
-    times: list[list[float]] = [[] for _ in functions]
-    end = time.perf_counter() + seconds * len(functions)
-    while time.perf_counter() < end or len(times[0]) < 5:
-        for function, durations in zip(functions, times, strict=True):
-            begin = time.perf_counter()
-            jax.block_until_ready(function())
-            durations.append((time.perf_counter() - begin) * 1e6)
-    return [statistics.median(durations) for durations in times]
 
 
 def batch(size: int, shape: tuple[int, int] = (80, 80)) -> tuple[np.ndarray, np.ndarray]:
@@ -65,30 +47,35 @@ def sensing(sensor: SensorConfig, frames: np.ndarray, points: np.ndarray) -> Cal
     """A compiled call on arrays in the device's memory; vmapped where there is a batch."""
     run = functools.partial(sense, sensor=sensor, bounds="window")
     compiled = jax.jit(jax.vmap(run) if frames.ndim == 3 else run)
-    return functools.partial(compiled, jnp.asarray(frames), jnp.asarray(points))
+    inputs = jnp.asarray(frames), jnp.asarray(points)
+    return lambda: jax.block_until_ready(compiled(*inputs))
 
 
 def per_sensor() -> dict[str, float]:
     """Microseconds to sense 32 frames of 80x80."""
-    results = {}
+    calls = {}
     frames, points = batch(32)
     for name, sensor in sensors().items():
         centred = np.full_like(points, 40)
         inside = points if sensor.window is not None and sensor.window[0] <= 70 else centred
-        (results[name],) = median_times([sensing(sensor, frames, inside)])
-        print(f"  {name:24} {results[name]:8.0f} us")
+        calls[name] = sensing(sensor, frames, inside)
+    (results,) = cost.medians([calls], REPEATS)
+    for name, median in results.items():
+        print(f"  {name:24} {median:8.0f} us")
     return results
 
 
 def large_frame() -> dict[str, float]:
     """Microseconds for one frame, small and large, seen by the same sensor."""
-    calls = []
-    for shape in ((80, 80), (1080, 1920)):
-        frames, _ = batch(1, shape)
-        calls.append(sensing(CONSTANT70_PACKED, frames[0], np.array(shape, np.int32) // 2))
-    small, large = median_times(calls)
+    calls = {}
+    for height, width in ((80, 80), (1080, 1920)):
+        frames, _ = batch(1, (height, width))
+        middle = np.array([height // 2, width // 2], np.int32)
+        calls[f"{height}x{width}"] = sensing(CONSTANT70_PACKED, frames[0], middle)
+    (results,) = cost.medians([calls], REPEATS)
+    small, large = results.values()
     print(f"  80x80 {small:8.1f} us    1080x1920 {large:8.1f} us    ratio {large / small:.2f}")
-    return {"80x80": small, "1080x1920": large, "ratio": large / small}
+    return results | {"ratio": large / small}
 
 
 def against_opencv() -> dict[str, float] | None:
@@ -110,23 +97,18 @@ def against_opencv() -> dict[str, float] | None:
 
     ours = sensing(CONSTANT70_PACKED, frames, points)
     np.testing.assert_allclose(ours()[0][..., 0], loop(), atol=1e-5)
-    sensed, looped = median_times([ours, loop], seconds=2.0)
+    (results,) = cost.medians([{"foajax": ours, "opencv": loop}], REPEATS)
+    sensed, looped = results.values()
     print(f"  foajax {sensed:8.0f} us    OpenCV {looped:8.0f} us    {looped / sensed:.1f} times faster")
-    return {"foajax": sensed, "opencv": looped, "speedup": looped / sensed}
+    return results | {"speedup": looped / sensed}
 
 
 def main(arguments: Sequence[str]) -> None:
     """Runs all three and writes JSON where `out=<file>` says so."""
     options = cli.parse(bench.Options, arguments)
     runtime.wait_in_place()
-    results: dict[str, object] = {
-        "device": jax.devices()[0].device_kind,
-        "cpus": os.cpu_count(),
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-    }
-    print("  ".join(f"{key} {value}" for key, value in results.items()))
+    results: dict[str, object] = {"device": jax.devices()[0].device_kind}
+    print(f"device {results['device']}")
     print("Sensing 32 frames of 80x80")
     results["batch32_us"] = per_sensor()
     print("One frame, constant70 packed")

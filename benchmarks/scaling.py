@@ -25,7 +25,6 @@ import dataclasses
 import json
 import math
 import os
-import platform
 import socket
 import statistics
 import subprocess
@@ -82,11 +81,6 @@ class Assumptions:
     link: float = 100e9  # bytes a second between the GPUs of a host: assumed
     network: float = 12.5e9  # bytes a second between hosts, 100 Gbit/s: assumed
     delay: float = 20e-6  # of a message between hosts: assumed
-
-
-def pinnable() -> list[int]:
-    """This process's cores; none where a system cannot say."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def start(
@@ -274,15 +268,8 @@ def main(arguments: Sequence[str]) -> None:
             print(" ".join(str(error).split()), flush=True)
             os._exit(1)  # an orderly end would wait for the other one
         return
-    import jaxlib
-
-    versions = {
-        "python": platform.python_version(),
-        "jax": jaxlib.__version__,
-        "cores": len(pinnable()) or os.cpu_count(),
-    }
-    result: dict[str, Any] = {"options": to_mapping(options), **versions}
-    cores = pinnable()[:2]
+    result: dict[str, Any] = {"options": to_mapping(options)}
+    cores = sorted(os.sched_getaffinity(0))[:2] if hasattr(os, "sched_getaffinity") else []
     if len(cores) < 2 and options.part != "model":
         print("left out: weak and allreduce, which need two cores to pin processes to", file=sys.stderr)
     if len(cores) == 2 and options.part in ("all", "weak"):

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import signal
 import statistics
 import subprocess
@@ -21,27 +20,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import ConfigError, Section
+from foajax.config.parse import ConfigError
+from foajax.reporting import bench
 
 _EVERY = 1.0  # seconds between two looks
 
 
-class Options(Section):
+class Options(bench.Options):
     """What the command takes besides the keys of a run."""
 
     minutes: float = Field(30.0, ge=2, description="How long to watch.")
-    out: str | None = Field(None, description="File for the result.")
     run: str | None = Field(None, description="Directory of the run; null for a temporary one.")
-
-    def check(self) -> None:
-        cli.check_file("out", self.out)
 
 
 class Sample(NamedTuple):
@@ -150,10 +145,8 @@ def main(words: Sequence[str]) -> int:
     found = complaints(result)
     print("; ".join(found) or f"as it began, after {seconds / 60:g} minutes and {rows[-1]['env_steps']:,} env_steps")
     if options.out:
-        cores = len(os.sched_getaffinity(0))
-        machine = {"machine": platform.platform(), "cores": cores, "jax": version("jax"), "words": rest}
-        report = machine | {"seconds": seconds, "result": result, "samples": samples}
-        Path(options.out).write_text(json.dumps(report) + "\n")
+        report = {"seconds": seconds, "result": result, "samples": samples}
+        bench.write("out", options.out, report, ["python", "benchmarks/soak.py", *words])
     return 1 if found else 0
 
 

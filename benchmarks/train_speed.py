@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -22,7 +20,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from typing import Any
 
 import jax
@@ -34,6 +31,7 @@ from rich.table import Table
 from foajax import cli
 from foajax.config.compose import compose
 from foajax.config.schema import Config
+from foajax.envs.base import Environment
 from foajax.envs.make import make_environments
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_programs, make_state
@@ -65,21 +63,27 @@ class Bench:
     def __init__(self, config: Config, resources: contextlib.ExitStack) -> None:
         self._learner = config.learner
         self._environments = make_environments(config, 0)
-        alone = make_environments(config, 1)
-        for environment in [*self._environments, *alone]:
+        self._alone = make_environments(config, 1)
+        for environment in [*self._environments, *self._alone]:
             resources.callback(environment.close)
         agent = Agent(config, self._environments[0].num_actions, self._environments[0].crop_top)
         self._programs = make_programs(agent)
         self._collector = Collector(agent, self._programs, self._environments, seed=config.seed)
         self._state = make_state(agent, config.seed)
-        self._alone = Alone(alone, config.learner.rollout_length)
+        self._random = np.random.default_rng(0)
+        for environment in self._alone:
+            environment.reset()
+            self._send_random(environment)
         self._step = 0
         self._metrics: list = []
         self.steps = config.env.num_envs * config.learner.rollout_length
 
     def env_only(self) -> None:
-        """The environments under random actions, and nothing else."""
-        self._alone.rollout()
+        """Environments under random actions, each sent on as soon as it is received, and nothing else."""
+        for _ in range(self._learner.rollout_length):
+            for environment in self._alone:
+                environment.recv()
+                self._send_random(environment)
 
     def act_only(self) -> None:
         """A rollout's decisions, all on the time step that is there."""
@@ -98,26 +102,9 @@ class Bench:
         self._state, self._metrics = update_on(rollouts, self._state, self._programs, self._learner)
         self._step += self._learner.rollout_length
 
-
-class Alone:
-    """Groups of environments that step as in training, each sent on as soon as it is received."""
-
-    def __init__(self, environments: Sequence[Any], length: int) -> None:
-        self._environments, self._length = environments, length
-        random = np.random.default_rng(0)
-        self._actions = [random.integers(0, e.num_actions, (64, e.num_envs)).astype(np.int32) for e in environments]
-        self._step = 0
-        for environment, actions in zip(environments, self._actions, strict=True):
-            environment.reset()
-            environment.send(actions[0])
-
-    def rollout(self) -> None:
-        """`length` steps of every group."""
-        for _ in range(self._length):
-            self._step += 1
-            for environment, actions in zip(self._environments, self._actions, strict=True):
-                environment.recv()
-                environment.send(actions[self._step % 64])
+    def _send_random(self, environment: Environment) -> None:
+        actions, batch = environment.num_actions, environment.num_envs
+        environment.send(self._random.integers(actions, size=batch, dtype=np.int32))
 
 
 def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
@@ -126,14 +113,14 @@ def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
     keep_memory()
     config = compose(words)
     with contextlib.ExitStack() as resources:
-        bench = Bench(config, resources)
-        calls = {part: getattr(bench, part) for part in PARTS}
+        subject = Bench(config, resources)
+        calls = {part: getattr(subject, part) for part in PARTS}
         for call in reversed(calls.values()):  # compiles; the loop first, so that there is a rollout to learn from
             call()
         turns: dict[str, list[tuple[float, float]]] = {part: [] for part in PARTS}
         for _ in range(options.repeats):
             for part, call in calls.items():
-                turns[part].append(_turn(call, bench.steps, options.seconds))
+                turns[part].append(_turn(call, subject.steps, options.seconds))
     record: dict[str, Any] = {
         "experiment": config.name,
         "torso": config.network.torso,
@@ -181,21 +168,15 @@ def main(arguments: Sequence[str]) -> None:
         groups = [f"experiment={name}", f"network={options.torso}", f"learner={options.learner}"]
         words = [*groups, f"env.num_envs={options.num_envs}", *more]
         runs.append((words, compose(words)))
-    device = {
-        "device": jax.devices()[0].device_kind,
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        **{package: version(package) for package in ("jax", "jaxlib", "flax", "envpool", "numpy")},
-    }
-    print("  ".join(f"{key} {value}" for key, value in device.items()), flush=True)
+    device = jax.devices()[0].device_kind
+    print(f"device {device}", flush=True)
     records = []
     for words, config in runs:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             record = pool.apply(measure, (words, options))
         if options.startup:
             record["startup_seconds"] = startup(words, config)
-        records.append(record | device)
+        records.append(record | {"device": device})
         print(_line(record), flush=True)
     _print(records)
     if options.out:

@@ -11,13 +11,10 @@ foajax itself does not use. Run it on an idle machine.
 
 from __future__ import annotations
 
-import os
-import platform
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import jax
@@ -96,13 +93,13 @@ def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]
         linear(params[n]) for n in ("natural_policy", "natural_value", "vision_policy", "vision_value") if n in params
     ]
 
-    def forward(images: Sequence[Any], focal_point: Any | None, keep: Any, state: tuple) -> list:
+    def forward(images: Sequence[Any], side: Any, keep: Any, state: tuple) -> list:
         parts = [torsos[i](x) if i in torsos else x.permute(0, 2, 3, 1).flatten(1) for i, x in enumerate(images)]
         features = torch.cat(parts, 1)
-        features = F.relu(dense(features)) if dense else features
-        if focal_point is not None:
-            features = torch.cat([features, focal_point], 1)
-        gates = project(features)
+        if dense:
+            normed = F.layer_norm(features, features.shape[-1:], eps=1e-6) if network.dense_norm else features
+            features = F.relu(dense(normed))
+        gates = project(torch.cat([features, side], 1))
         if norm:
             gates = F.layer_norm(gates, gates.shape[-1:], *norm, eps=1e-6)
         gates = gates.reshape(*keep.shape[:2], -1)
@@ -133,17 +130,18 @@ class Inputs(NamedTuple):
     """What both sides are given."""
 
     roi: list[np.ndarray]  # [T+1, B, h, w, 1] each
-    focal_point: np.ndarray  # [T+1, B, 2]
+    side: np.ndarray  # [T+1, B, S]: what the core is told beside the images
     is_first: np.ndarray  # [T+1, B]
 
     @classmethod
     def make(cls, agent: Agent, batch: int) -> Inputs:
         """Noise."""
         random = np.random.default_rng(0)
-        shapes = agent.image_shapes
+        integers, numbers = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
+        width = agent.side(integers, integers, numbers, jnp.zeros(1, bool)).shape[-1]
         return cls(
-            roi=[random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in shapes],
-            focal_point=random.uniform(-1, 1, (STEPS, batch, 2)).astype(np.float32),
+            roi=[random.normal(size=(STEPS, batch, *shape)).astype(np.float32) for shape in agent.image_shapes],
+            side=random.uniform(-1, 1, (STEPS, batch, width)).astype(np.float32),
             is_first=random.random((STEPS, batch)) < 0.02,
         )
 
@@ -186,19 +184,19 @@ def their_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable
     config = agent.config
     run, leaves = torch_network(params["params"], config.network)
     images = [torch.tensor(x.reshape(-1, *x.shape[2:]).transpose(0, 3, 1, 2)).contiguous() for x in inputs.roi]
-    point = torch.tensor(inputs.focal_point.reshape(-1, 2)) if agent.network.sees_focal_point else None
+    side = torch.tensor(inputs.side.reshape(-1, inputs.side.shape[-1]))
     keep = torch.tensor(1.0 - inputs.is_first[..., None].astype(np.float32))
     zeros = torch.zeros(inputs.is_first.shape[1], config.network.lstm)
     most = config.learner.max_grad_norm or 1e9
 
     def forward() -> list:
         with torch.no_grad():
-            return run(images, point, keep, (zeros, zeros))
+            return run(images, side, keep, (zeros, zeros))
 
     def gradient() -> list:
         for leaf in leaves:
             leaf.grad = None
-        outputs = run(images, point, keep, (zeros, zeros))
+        outputs = run(images, side, keep, (zeros, zeros))
         flat_loss(outputs, lambda x: torch.log_softmax(x, -1), torch.exp).backward()
         return [leaf.grad for leaf in leaves]
 
@@ -266,9 +264,6 @@ def main(arguments: Sequence[str]) -> None:
     keep_memory()
     device = {
         "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "jax": version("jax"),
         "torch": torch.__version__,
         "torch_threads": torch.get_num_threads(),
     }

@@ -102,7 +102,7 @@ def test_show_takes_the_key(tmp_path, capsys):
 
 
 def test_a_decision_in_colour_costs_two_more_channels_of_the_first_layer(tmp_path, monkeypatch):
-    monkeypatch.setattr(measured, "_time", lambda calls, repeats: [dict.fromkeys(group, 1.0) for group in calls])
+    monkeypatch.setattr(measured, "medians", lambda calls, repeats: [dict.fromkeys(group, 1.0) for group in calls])
     words = ["experiments=nonfoa", "repeats=1", "env.color=true", f"json={tmp_path / 'cost.json'}"]
     assert cli.run(cost.cost, words) == 0
     (found,) = json.loads((tmp_path / "cost.json").read_text())["results"]

@@ -35,14 +35,14 @@ class Options(Section):
 
 def write(key: str, path: str, results: Any, command: Sequence[str]) -> None:
     """Writes what `command` has found, with all that is needed to judge and repeat it."""
-    today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    about = {
+    found = {
         "command": shlex.join(command),
         "commit": commit(),
-        "date": today,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": machine(),
+        "results": results,
     }
-    cli.write_json(key, path, {**about, "results": results})
+    cli.write_json(key, path, found)
 
 
 def write_table(directory: Path = BENCH) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from foajax.reporting.curves import RunData, on_common_axis
-from foajax.reporting.scores import CONFIDENCE, REFERENCE, RESAMPLES, Interval, interval
+from foajax.reporting.scores import CONFIDENCE, QUANTILES, REFERENCE, Interval, interval, resampled
 from foajax.viewing.heatmap import HeatMap
 
 SEEDS = 3  # of each experiment, for a verdict
@@ -134,19 +134,10 @@ def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) ->
         return slow_x[np.argmax(slow_mean >= level, axis=1)] / fast_x[np.argmax(fast_mean >= level, axis=1)]
 
     random = np.random.default_rng(0)
-    drawn = [
-        curves[random.integers(0, len(curves), (RESAMPLES, len(curves)))].mean(axis=1)
-        for curves in (slow_curves, fast_curves)
-    ]
-    low, high = np.quantile(ratio(*drawn), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    drawn = [resampled(curves, random).mean(axis=1) for curves in (slow_curves, fast_curves)]
+    low, high = np.quantile(ratio(*drawn), QUANTILES)
     value = ratio(slow_curves.mean(axis=0, keepdims=True), fast_curves.mean(axis=0, keepdims=True))
     return Interval(float(value[0]), float(low), float(high))
-
-
-def told(number: Interval) -> str:
-    """A number and its interval, in three digits or whole numbers."""
-    value, low, high = (f"{each:,.0f}" if 1000 <= abs(each) < math.inf else f"{each:.3g}" for each in number)
-    return f"{value} [{low}, {high}]" if low != high else value
 
 
 def _compare(
@@ -160,7 +151,7 @@ def _compare(
             continue
         a, b = (measure(game.runs[name]) for name in pair)
         found = over(above_chance(a, game.name), above_chance(b, game.name))
-        seen = f"{what}: `{pair[0]}` {told(a)}, `{pair[1]}` {told(b)}; ratio {told(found)}"
+        seen = f"{what}: `{pair[0]}` {a}, `{pair[1]}` {b}; ratio {found}"
         parts.append(Part(found, min(len(game.runs[name]) for name in pair), seen))
     return parts
 
@@ -182,7 +173,7 @@ def _longer(slow: str, fast: str) -> Callable[[Game], list[Part | None]]:
         steps, hours = (times_longer(*groups, axis) for axis in ("env_steps", "time"))
         if steps is None or hours is None:
             return [None]
-        seen = f"`{slow}` takes {told(steps)} times the steps of `{fast}`, and {told(hours)} times the core hours"
+        seen = f"`{slow}` takes {steps} times the steps of `{fast}`, and {hours} times the core hours"
         return [Part(steps, min(map(len, groups)), seen)]
 
     return parts
@@ -195,7 +186,7 @@ def _gaze(number: str, what: str) -> Callable[[Game], list[Part | None]]:
         if not heats:
             return None
         found = interval([np.array([getattr(heat, number) for heat in heats])], np.mean)
-        return Part(found, len(heats), f"{what}: `{name}` {told(found)}")
+        return Part(found, len(heats), f"{what}: `{name}` {found}")
 
     return lambda game: [part(name, game.heats.get(name, ())) for name in WATCHED]
 

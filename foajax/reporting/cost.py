@@ -25,13 +25,14 @@ BATCHES = (1, 32)
 _NUM_ACTIONS = 4  # Breakout's
 REFERENCE = "nonfoa"
 PARTS = ("sense", "network", "decision")
+Calls = dict[str, Callable[[], Any]]  # by the name of the result; each returns when it is done
 
 
 class Subject(NamedTuple):
     """An experiment to be measured."""
 
     exact: dict[str, Any]  # what is counted
-    calls: dict[str, Callable[[], Any]]  # what is timed, by the name of the result
+    calls: Calls  # what is timed
 
 
 def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repeats: int) -> list[dict[str, Any]]:
@@ -44,7 +45,7 @@ def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repe
     """
     names = list(dict.fromkeys([*experiments, REFERENCE]))
     subjects = [_subject(compose([f"experiment={name}", f"network={torso}", f"env.color={color}"])) for name in names]
-    times = _time([subject.calls for subject in subjects], repeats)
+    times = medians([subject.calls for subject in subjects], repeats)
     records = [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
     reference = records[names.index(REFERENCE)]
     for record in records:
@@ -56,13 +57,8 @@ def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repe
 def measure_decisions(configs: Sequence[Config], *, repeats: int) -> list[dict[str, Any]]:
     """For each run what is counted and, timed on this machine, `decision_us_batch1`."""
     subjects, key = [_subject(config) for config in configs], "decision_us_batch1"
-    times = _time([{key: subject.calls[key]} for subject in subjects], repeats)
+    times = medians([{key: subject.calls[key]} for subject in subjects], repeats)
     return [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
-
-
-def sense(agent: Agent, frame: Float[Array, "B H W *C"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
-    """The sensor's part of a decision."""
-    return agent.sense(frame, focal_point)
 
 
 def decide(
@@ -95,7 +91,7 @@ def decision(
     key: PRNGKeyArray,
 ) -> tuple[Array, Array, Carry]:
     """Both parts as one program."""
-    return decide(agent, params, sense(agent, frame, focal_point), focal_point, core_state, key)
+    return decide(agent, params, agent.sense(frame, focal_point), focal_point, core_state, key)
 
 
 def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ _"], ...]) -> list[Array]:
@@ -138,7 +134,7 @@ def _count(agent: Agent, params: Params) -> dict[str, Any]:
     """What is the same on every machine, at batch 1."""
     config = agent.config
     frame, focal_point, core_state, key = _inputs(agent, 1)
-    roi = jax.eval_shape(functools.partial(sense, agent), frame, focal_point)
+    roi = jax.eval_shape(agent.sense, frame, focal_point)
     pixels = agent.sensor.count(config.env.frame_shape)
     return {
         "experiment": config.name,
@@ -163,28 +159,33 @@ def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, Carry, Array]:
 def _calls(agent: Agent, params: Params, batch: int) -> list[Callable[[], Any]]:
     """What is timed: sensor, network, and both as one program."""
     frame, focal_point, core_state, key = _inputs(agent, batch)
-    look, think, both = (jax.jit(functools.partial(part, agent)) for part in (sense, decide, decision))
+    look = jax.jit(agent.sense)
+    think, both = (jax.jit(functools.partial(part, agent)) for part in (decide, decision))
     roi = look(frame, focal_point)
     return [
-        functools.partial(look, frame, focal_point),
-        functools.partial(think, params, roi, focal_point, core_state, key),
-        functools.partial(both, params, frame, focal_point, core_state, key),
+        lambda: jax.block_until_ready(look(frame, focal_point)),
+        lambda: jax.block_until_ready(think(params, roi, focal_point, core_state, key)),
+        lambda: jax.block_until_ready(both(params, frame, focal_point, core_state, key)),
     ]
 
 
-def _time(calls: Sequence[dict[str, Callable[[], Any]]], repeats: int) -> list[dict[str, float]]:
-    """Medians in microseconds; the calls take turns, each after one of its own that is not timed.
+def medians(calls: Sequence[Calls], repeats: int) -> list[dict[str, float]]:
+    """Median duration of each call in microseconds, as `take_turns` times them."""
+    taken = take_turns(calls, repeats)
+    return [{name: statistics.median(values) for name, values in times.items()} for times in taken]
+
+
+def take_turns(calls: Sequence[Calls], repeats: int) -> list[dict[str, list[float]]]:
+    """Durations in microseconds; the calls take turns, each after one of its own that is not timed.
 
     A robot's loop decides again and again: the caches then hold the parameters and the threads are awake.
     """
-    for call in [call for group in calls for call in group.values()]:
-        jax.block_until_ready(call())  # compiles
     taken: list[dict[str, list[float]]] = [{name: [] for name in group} for group in calls]
     for _ in range(repeats):
         for group, times in zip(calls, taken, strict=True):
             for name, call in group.items():
-                jax.block_until_ready(call())
+                call()
                 begin = time.perf_counter()
-                jax.block_until_ready(call())
+                call()
                 times[name].append(1e6 * (time.perf_counter() - begin))
-    return [{name: statistics.median(values) for name, values in times.items()} for times in taken]
+    return taken

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.optimize import isotonic_regression
 
 from foajax.config.parse import refuse
 from foajax.config.schema import Config
-from foajax.reporting.scores import CONFIDENCE, RESAMPLES, Interval
+from foajax.reporting.scores import CONFIDENCE, QUANTILES, Interval, resampled
 from foajax.runs.agents import check_trust
 from foajax.runs.directory import load_config
 from foajax.runs.rows import parse_row
@@ -117,9 +118,8 @@ def band(runs: Sequence[RunData], axis: str) -> Band | None:
     if common is None:
         return None
     x, curves = common
-    drawn = np.random.default_rng(0).integers(0, len(runs), (RESAMPLES, len(runs)))
-    means = curves[drawn].mean(axis=1)
-    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    means = resampled(curves, np.random.default_rng(0)).mean(axis=1)
+    low, high = np.quantile(means, QUANTILES, axis=0)
     return Band(x, curves.mean(axis=0), low, high)
 
 
@@ -187,14 +187,9 @@ def _name_lines(plot: Any, ends: Mapping[str, float], colours: Mapping[str, str]
 
 def spread(wanted: Sequence[float], gap: float) -> list[float]:
     """Places in the order of those `wanted` and at least `gap` apart, as near to them as can be."""
-    order = np.argsort(wanted, kind="stable")
-    blocks: list[list[float]] = []
-    for i, place in enumerate(np.asarray(wanted, float)[order]):
-        blocks.append([place - i * gap])
-        while len(blocks) > 1 and np.mean(blocks[-2]) > np.mean(blocks[-1]):
-            blocks[-2:] = [blocks[-2] + blocks[-1]]
+    order, gaps = np.argsort(wanted, kind="stable"), gap * np.arange(len(wanted))
     placed = np.empty(len(order))
-    placed[order] = np.concatenate([[np.mean(block)] * len(block) for block in blocks]) + gap * np.arange(len(order))
+    placed[order] = isotonic_regression(np.asarray(wanted, float)[order] - gaps).x + gaps
     return placed.tolist()
 
 

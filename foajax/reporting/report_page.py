@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from foajax.cli import make_directory
@@ -43,7 +44,8 @@ class Page:
         """Appends a figure as a drawing, and writes it as a PNG."""
         figure.savefig(self._directory / f"{name}.png", dpi=160)
         content = io.BytesIO()
-        figure.savefig(content, format="svg", metadata={"Date": None})
+        with rc_context({"svg.hashsalt": "foajax"}):  # the same figure, the same file
+            figure.savefig(content, format="svg", metadata={"Date": None})
         self.add(_image(content.getvalue(), "svg+xml", alternative))
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> None:
@@ -78,7 +80,7 @@ def build(
     page = Page(directory)
     runs = runs_of(games)
     page.add(f"<h1>foajax: {preset or 'report'}</h1>")
-    page.add(f'<p class="note">{_plural(len(runs), "run")} on {html.escape(", ".join(games))}.</p>')
+    page.add(f'<p class="note">{len(runs)} run{"s" if len(runs) > 1 else ""} on {html.escape(", ".join(games))}.</p>')
     _add_summary(page, games, repeats)
     _add_curves(page, games)
     _add_scores(page, games)
@@ -224,7 +226,3 @@ def _make_map(run: RunData, episodes: int) -> HeatMap | None:
 def note(text: str) -> None:
     """A line beside the results."""
     print(text, file=sys.stderr, flush=True)
-
-
-def _plural(count: int, word: str) -> str:
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"

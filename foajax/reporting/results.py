@@ -225,8 +225,8 @@ def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str
         f"`{label}`",
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
         str(len(runs)),
-        claims.told(found),
-        claims.told(of_whole) if of_whole and label != "nonfoa" else "",
+        str(found),
+        str(of_whole) if of_whole and label != "nonfoa" else "",
         *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
         f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
     ]

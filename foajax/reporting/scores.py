@@ -6,6 +6,7 @@ rliable. Scores are given game by game, one number a run; games may have differe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 RESAMPLES = 2000
 CONFIDENCE = 0.95
+QUANTILES = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 
 # Scores of random play and of a human tester (Wang et al., 2016, for the Atari games; for seek what its rules say).
 REFERENCE = {
@@ -32,7 +34,9 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" if self.low < self.high else f"{self.value:.4g}"
+        """In three digits or whole numbers."""
+        value, low, high = (f"{each:,.0f}" if 1000 <= abs(each) < math.inf else f"{each:.3g}" for each in self)
+        return f"{value} [{low}, {high}]" if low != high else value
 
 
 def iqm(scores: Float[np.ndarray, "n"]) -> float:
@@ -41,13 +45,7 @@ def iqm(scores: Float[np.ndarray, "n"]) -> float:
     return float(np.sort(scores)[cut : len(scores) - cut].mean())
 
 
-def interval(
-    strata: Sequence[Float[np.ndarray, "_"]],
-    statistic: Callable[[np.ndarray], float],
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> Interval:
+def interval(strata: Sequence[Float[np.ndarray, "_"]], statistic: Callable[[np.ndarray], float]) -> Interval:
     """A statistic of all scores together, and its percentile interval by stratified bootstrap.
 
     Each resample draws, game by game, as many of the game's runs as there are, with replacement.
@@ -55,14 +53,17 @@ def interval(
     Args:
       strata: scores of a game's runs, one array a game.
       statistic: of an array of scores.
-      resamples: how many are drawn.
-      seed: of the draws.
     """
-    random = np.random.default_rng(seed)
-    drawn = [scores[random.integers(0, len(scores), (resamples, len(scores)))] for scores in strata]
+    random = np.random.default_rng(0)
+    drawn = [resampled(scores, random) for scores in strata]
     values = [statistic(resample) for resample in np.concatenate(drawn, axis=1)]
-    low, high = np.quantile(values, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.quantile(values, QUANTILES)
     return Interval(statistic(np.concatenate(list(strata))), float(low), float(high))
+
+
+def resampled(runs: Float[np.ndarray, "n *m"], random: np.random.Generator) -> Float[np.ndarray, "_ n *m"]:
+    """`RESAMPLES` samples, each of as many runs as there are, drawn with replacement."""
+    return runs[random.integers(0, len(runs), (RESAMPLES, len(runs)))]
 
 
 def normalised(game: str, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:

@@ -50,7 +50,6 @@ _TARGETS = {
 }
 _SMALL = list(_SENSORS)[:5]  # of about 600 values
 _DETECTION = "detect_rings_p"
-_NOT_RUN = "not run yet"
 
 Groups = Mapping[str, Sequence[RunData]]
 
@@ -105,26 +104,26 @@ def block(groups: Groups) -> str:
 
 def _row(groups: Groups, name: str, label: str) -> list[str]:
     if name not in groups:
-        return [label, *[""] * (len(SIZES) + 4), _NOT_RUN]
+        return [label, *[""] * (len(SIZES) + 4), claims.NOT_RUN]
     runs = groups[name]
     config = runs[0].config
     return [
         label,
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
         *_trained(runs),
-        *(claims.told(earned(runs, size)) for size in SIZES),
-        claims.told(measure(runs, f"accuracy_{SIZES[-1]}")),
-        claims.told(measure(runs, "decisions")),
+        *(str(earned(runs, size)) for size in SIZES),
+        str(measure(runs, f"accuracy_{SIZES[-1]}")),
+        str(measure(runs, "decisions")),
     ]
 
 
 def _slopes(groups: Groups, name: str, label: str) -> list[str]:
     if name not in groups:
-        return [label, "", "", "", "", _NOT_RUN]
+        return [label, "", "", "", "", claims.NOT_RUN]
     runs = groups[name]
     asked = ("slope_present", *(["slope_absent"] if runs[0].config.search.absent else []))
-    slopes = [claims.told(measure(runs, key)) for key in asked]
-    return [label, *_trained(runs), *slopes, *[""] * (2 - len(slopes)), claims.told(measure(runs, "accuracy"))]
+    slopes = [str(measure(runs, key)) for key in asked]
+    return [label, *_trained(runs), *slopes, *[""] * (2 - len(slopes)), str(measure(runs, "accuracy"))]
 
 
 def _trained(runs: Sequence[RunData]) -> tuple[str, str]:
@@ -134,7 +133,7 @@ def _trained(runs: Sequence[RunData]) -> tuple[str, str]:
 
 def _eight(runs: Sequence[RunData]) -> str:
     config = runs[0].config
-    earned = claims.told(over_seeds([run.final_score for run in runs]))
+    earned = over_seeds([run.final_score for run in runs])
     return (
         f"Trained on scenes of eight letters alone, for {config.train.env_steps:,} decisions, rings and periphery earn "
         f"{earned} there (seeds: {len(runs)}). Full sight earns {optimal_return(config.search)}."
@@ -143,8 +142,8 @@ def _eight(runs: Sequence[RunData]) -> str:
 
 def _detection(runs: Sequence[RunData]) -> str:
     names = ("accuracy", "hit_rate", "decisions", "distance", "overlap")
-    right, hit, decisions, distance, overlap = (claims.told(measure(runs, name)) for name in names)
-    earned = claims.told(over_seeds([run.final_score for run in runs]))
+    right, hit, decisions, distance, overlap = (measure(runs, name) for name in names)
+    earned = over_seeds([run.final_score for run in runs])
     return (
         f"Detection (seeds: {len(runs)}): the return is {earned}, with {decisions} decisions. The share of right "
         f"answers is {hit}, that of scenes answered right {right}. At an answer the focal point is {distance} pixels "

@@ -157,7 +157,7 @@ class Sensor:
         """The images at a focal point (y, x). The frame is normalised where it is looked at, and only there."""
         frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3)) if self._by_frame else frame
         frame, arrays, sensor = np.atleast_3d(frame)[..., self._channel], self._arrays, self._sensor
-        top, left = focal_point - self._window // 2
+        top, left = (focal_point - self._window // 2).tolist()
         window = self._cut(frame, top, left) - self._cut(arrays["mean"][self._channel], top, left)
         if sensor["kind"] == "logpolar":
             values = np.add.reduceat(window.ravel()[arrays["pixel"]] * arrays["weight"], arrays["first"])

@@ -126,17 +126,17 @@ def run(
     latencies, logged, reward = Latencies(), time.monotonic(), 0.0
     begin = time.perf_counter()
     for image in camera.images(stopped):
-        marks, seconds = [begin, time.perf_counter()], {}
-        natural, vision = agent.decide(image, reward)
-        marks.append(time.perf_counter())
+        ends = {"read": time.perf_counter()}
+        actions = agent.decide(image, reward)
+        ends["decide"] = time.perf_counter()
         if drive is not None:
-            reward = drive(natural, vision) or 0.0
-        marks.append(time.perf_counter())
+            reward = drive(*actions) or 0.0
+            ends["drive"] = time.perf_counter()
         if draw is not None:
             draw(drawn(image, agent))
-        marks.append(time.perf_counter())
-        used = {"read": True, "decide": True, "drive": drive is not None, "draw": draw is not None}
-        seconds = {s: end - start for s, start, end in zip(STAGES, marks[:-1], marks[1:], strict=True) if used[s]}
+            ends["draw"] = time.perf_counter()
+        begins = [begin, *ends.values()]
+        seconds = {stage: end - start for (stage, end), start in zip(ends.items(), begins, strict=False)}
         latencies.add(seconds, camera.period)
         if time.monotonic() - logged >= log_every:
             logged = time.monotonic()
@@ -200,8 +200,7 @@ def main(words: list[str] | None = None) -> int:
         camera = Camera(options.source, rate=rate, retries=options.retries, wait=options.wait)
         film = Film(options.draw, camera.period) if options.draw else None
         drive = _function(options.drive) if options.drive else None
-        stopped = lambda: bool(requests)  # noqa: E731
-        found = run(agent, camera, drive=drive, draw=film, stopped=stopped, log_every=options.log_every)
+        found = run(agent, camera, drive=drive, draw=film, stopped=lambda: bool(requests), log_every=options.log_every)
         say(f"{'stopped' if requests else 'end'}: {found}")
         return 0
     except AgentError as error:

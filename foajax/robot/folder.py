@@ -93,7 +93,9 @@ def fill(
 ) -> None:
     """Makes the folder, without a check: network, arrays, recorded steps, code, and the facts with all checksums."""
     folder.mkdir()
-    model = WEIGHTS[dtype](onnx_graph.policy(stored.agent, stored.params, _labels(stored)))
+    config = stored.agent.config
+    labels = {"game": config.game, "experiment": config.name, "env_steps": str(stored.env_steps)}
+    model = WEIGHTS[dtype](onnx_graph.policy(stored.agent, stored.params, labels))
     (folder / "policy.onnx").write_bytes(model.SerializeToString())
     contents: dict[str, Any] = arrays(stored.agent, stored.statistics)
     np.savez_compressed(folder / "arrays.npz", **contents)
@@ -222,11 +224,6 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
         painting = tables(packed, shape)
         found |= {"paint_window": painting.window, "paint_background": painting.background}
     return found
-
-
-def _labels(stored: TrainedAgent) -> Mapping[str, str]:
-    config = stored.agent.config
-    return {"game": config.game, "experiment": config.name, "env_steps": str(stored.env_steps)}
 
 
 def _provenance(stored: TrainedAgent, source: str, command: Sequence[str]) -> dict[str, Any]:

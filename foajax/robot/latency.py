@@ -7,16 +7,13 @@ a time, on one thread. Calls take turns, so that whatever else the machine does 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import json
 import math
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -29,8 +26,9 @@ from foajax.config.compose import compose
 from foajax.config.parse import refuse
 from foajax.config.schema import Config
 from foajax.learning.agent import Agent
-from foajax.reporting.cost import REFERENCE, count
+from foajax.reporting.cost import REFERENCE, Calls, count, take_turns
 from foajax.robot import folder
+from foajax.robot.agent import Agent as Exported
 from foajax.runs.agents import TrainedAgent
 from foajax.types import SCREEN_SHAPE, FrameStatistics, TimeStep
 
@@ -86,10 +84,9 @@ def _measure(configs: Sequence[Config], dtype: str, repeats: int) -> list[dict[s
         paths = [Path(made) / str(i) for i in range(len(stored))]
         for path, agent in zip(paths, stored, strict=True):
             folder.fill(path, agent, {}, {}, dtype)
-        module = _load(paths[0] / "agent.py")
-        calls = [_calls(module, path, agent) for path, agent in zip(paths, stored, strict=True)]
+        calls = [_calls(path, agent) for path, agent in zip(paths, stored, strict=True)]
         records: list[dict[str, Any]] = [_process(path) for path in paths]
-        for path, record, times in zip(paths, records, _time(calls, repeats), strict=True):
+        for path, record, times in zip(paths, records, take_turns(calls, repeats), strict=True):
             record["bytes"] = (path / "policy.onnx").stat().st_size
             for part, taken in times.items():
                 record[f"{part}_us"], record[f"{part}_us_p99"] = np.percentile(taken, [50, 99]).tolist()
@@ -112,28 +109,20 @@ def _untrained(config: Config) -> TrainedAgent:
     return TrainedAgent(agent, params, statistics, 0)
 
 
-def _load(file: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("exported_agent", file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def _process(path: Path) -> dict[str, float]:
     """Of a process of its own: seconds from the first import to the first decision, and megabytes."""
     ended = subprocess.run([sys.executable, "-c", _PROCESS, str(path)], capture_output=True, text=True, check=True)
     return json.loads(ended.stdout)
 
 
-def _calls(module: ModuleType, path: Path, stored: TrainedAgent) -> dict[str, Callable[[], Any]]:
+def _calls(path: Path, stored: TrainedAgent) -> Calls:
     random = np.random.default_rng(0)
     screen, image = (random.integers(0, 256, shape, np.uint8) for shape in (stored.agent.screen_shape, _IMAGE))
-    player, watcher = module.Agent(path), module.Agent(path, source="camera", order="bgr")
+    player, watcher = Exported(path), Exported(path, source="camera", order="bgr")
     frame = player.frame(screen)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = 1, 3
-    calls: dict[str, Callable[[], Any]] = {
+    calls: Calls = {
         "frame": lambda: player.frame(screen),
         "sense": lambda: [sensor.look(frame, player.focal_point) for sensor in player._sensors],
     }
@@ -157,16 +146,3 @@ def _jax(stored: TrainedAgent, screen: np.ndarray) -> Callable[[], Any]:
     timestep = TimeStep(screen[None], np.zeros(1, np.float32), is_first=false, is_terminal=false)
     inputs = stored.params, stored.statistics, state, timestep, jax.random.key(0)
     return lambda: jax.block_until_ready(act(*inputs)[0].natural_action)
-
-
-def _time(calls: Sequence[dict[str, Callable[[], Any]]], repeats: int) -> list[dict[str, list[float]]]:
-    """Microseconds of each call, after one of its own that is not timed."""
-    taken: list[dict[str, list[float]]] = [{name: [] for name in group} for group in calls]
-    for _ in range(repeats):
-        for group, times in zip(calls, taken, strict=True):
-            for name, call in group.items():
-                call()
-                begin = time.perf_counter()
-                call()
-                times[name].append(1e6 * (time.perf_counter() - begin))
-    return taken

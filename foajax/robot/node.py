@@ -53,48 +53,18 @@ class AgentNode(Node):
         self._last, self._reward = -np.inf, 0.0
         self._action = self.create_publisher(Int32, get("action"), 1)
         self._gaze = self.create_publisher(Point, get("gaze"), 1)
-        kind, listen = (CompressedImage, self.on_compressed) if get("compressed") else (Image, self.on_image)
-        self.create_subscription(kind, get("image"), listen, qos_profile_sensor_data)
+        kind, self._unpack = (CompressedImage, decode) if get("compressed") else (Image, unpack)
+        self.create_subscription(kind, get("image"), self.on_image, qos_profile_sensor_data)
         self.create_subscription(Empty, "reset", self.on_reset, 1)
         self.create_subscription(Float32, "reward", self.on_reward, 1)
 
-    def on_image(self, message: Image) -> None:
-        """A raw image."""
-        if self._is_early():
+    def on_image(self, message: Image | CompressedImage) -> None:
+        """Decides upon an image and publishes that, unless it comes too soon."""
+        if time.monotonic() - self._last < EARLY * self.period:
             return
         try:
-            image, order = unpack(message)
-        except AgentError as error:
-            self.get_logger().error(str(error))
-            return
-        self._decide(image, order)
-
-    def on_compressed(self, message: CompressedImage) -> None:
-        """A JPEG or PNG image."""
-        if self._is_early():
-            return
-        image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR) if len(message.data) else None
-        if image is None:
-            self.get_logger().error(f"format={message.format}: accepted is an image that OpenCV decodes")
-            return
-        self._decide(image, "bgr")
-
-    def on_reset(self, _: Empty) -> None:
-        """An episode begins: memory and gaze start anew."""
-        self.agent.reset()
-        self._reward = 0.0
-
-    def on_reward(self, message: Float32) -> None:
-        """What the last action has earned; rewards between two decisions add up."""
-        self._reward += message.data
-
-    def _is_early(self) -> bool:
-        return time.monotonic() - self._last < EARLY * self.period
-
-    def _decide(self, image: np.ndarray, order: str) -> None:
-        self._last = time.monotonic()
-        self.agent.order = order
-        try:
+            image, self.agent.order = self._unpack(message)
+            self._last = time.monotonic()
             natural, _ = self.agent.decide(image, self._reward)
         except AgentError as error:
             self.get_logger().error(str(error))
@@ -106,6 +76,15 @@ class AgentNode(Node):
         took = time.monotonic() - self._last
         if took > self.period:
             self.get_logger().warning(f"a decision took {1e3 * took:.1f} ms, its period is {1e3 * self.period:.1f} ms")
+
+    def on_reset(self, _: Empty) -> None:
+        """An episode begins: memory and gaze start anew."""
+        self.agent.reset()
+        self._reward = 0.0
+
+    def on_reward(self, message: Float32) -> None:
+        """What the last action has earned; rewards between two decisions add up."""
+        self._reward += message.data
 
 
 def unpack(message: Image) -> tuple[np.ndarray, str]:
@@ -122,6 +101,14 @@ def unpack(message: Image) -> tuple[np.ndarray, str]:
         raise AgentError(f"image={height}x{width}, step {step}, {len(message.data)} bytes: accepted is a whole image")
     rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)[:, : width * channels]
     return (rows if channels == 1 else rows.reshape(height, width, channels)), order
+
+
+def decode(message: CompressedImage) -> tuple[np.ndarray, str]:
+    """A JPEG or PNG image as uint8 [h, w, 3], and its order; `AgentError` where OpenCV cannot decode it."""
+    image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR) if len(message.data) else None
+    if image is None:
+        raise AgentError(f"format={message.format}: accepted is an image that OpenCV decodes")
+    return image, "bgr"
 
 
 def main() -> int:

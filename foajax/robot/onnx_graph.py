@@ -7,7 +7,6 @@ the next state. The batch is free. Episodes are the caller's: a state of zeros b
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -22,6 +21,7 @@ from foajax.config.parse import refuse
 from foajax.config.schema import NetworkConfig
 from foajax.learning.agent import Agent
 from foajax.networks.network import smallest_image
+from foajax.runs.agents import named
 from foajax.types import Params
 
 OPSET = 17  # the first with LayerNormalization; runtimes since 2022 have it
@@ -34,7 +34,7 @@ class Graph:
     """Collects nodes and constants. Each method gives the name of the value that it adds."""
 
     def __init__(self, params: Mapping[str, Any]) -> None:
-        self._params = dict(_flat(params))
+        self._params = named(params)
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
         self.inputs: list[onnx.ValueInfoProto] = []
@@ -114,14 +114,6 @@ Core = Callable[[Graph, NetworkConfig, str, np.ndarray], str]
 Torso = Callable[[Graph, NetworkConfig, str, str, Image], tuple[str, Image]]
 
 
-@dataclasses.dataclass(frozen=True)
-class Features:
-    """What the images have become: a value [batch, F] and the place of each of its numbers in the network's order."""
-
-    name: str
-    order: np.ndarray
-
-
 def policy(agent: Agent, params: Params, facts: Mapping[str, str]) -> onnx.ModelProto:
     """The network of an agent with its parameters; `facts` are written into the file for whoever opens it.
 
@@ -131,9 +123,8 @@ def policy(agent: Agent, params: Params, facts: Mapping[str, str]) -> onnx.Model
     config = agent.config.network
     graph = Graph(params["params"])
     write_core = _known("network.core", config.core, CORES)
-    features = _features(graph, config, agent.image_shapes)
+    x, order = _features(graph, config, agent.image_shapes)
     side = side_width(agent)
-    x, order = features.name, features.order
     if side:
         x = graph.node("Concat", "told", x, graph.input("side", side), axis=-1)
         order = np.concatenate([order, len(order) + np.arange(side)])
@@ -163,8 +154,11 @@ def _model(graph: Graph, facts: Mapping[str, str]) -> onnx.ModelProto:
     return onnx.shape_inference.infer_shapes(model, check_type=True, strict_mode=True, data_prop=True)
 
 
-def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> Features:
-    """Torso on every image, concatenated; then the dense layer if there is one."""
+def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> tuple[str, np.ndarray]:
+    """Torso on every image, concatenated; then the dense layer if there is one.
+
+    Gives a value [batch, F] and the place of each of its numbers in the network's order.
+    """
     write_torso = _known("network.torso", config.torso, TORSOS)
     names, orders, start = [], [], 0
     for i, shape in enumerate(shapes):
@@ -178,10 +172,10 @@ def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> F
     x = graph.node("Concat", "features", *names, axis=-1) if len(names) > 1 else names[0]
     order = np.concatenate(orders)
     if not config.dense:
-        return Features(x, order)
+        return x, order
     if config.dense_norm:
         x = graph.layer_norm("dense_norm", x, len(order))
-    return Features(graph.node("Relu", "dense_relu", graph.dense("dense", x, order)), np.arange(config.dense))
+    return graph.node("Relu", "dense_relu", graph.dense("dense", x, order)), np.arange(config.dense)
 
 
 def _nature(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -> tuple[str, Image]:
@@ -346,11 +340,3 @@ def _known(key: str, name: str, parts: Mapping[str, Any]) -> Any:
     if name not in parts:
         raise refuse(key, name, parts, why="cannot be exported")
     return parts[name]
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, np.ndarray]]:
-    leaves: list[tuple[str, np.ndarray]] = []
-    for name, value in tree.items():
-        path = f"{prefix}{name}"
-        leaves += _flat(value, path + "/") if isinstance(value, Mapping) else [(path, np.asarray(value, np.float32))]
-    return leaves

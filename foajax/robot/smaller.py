@@ -39,15 +39,12 @@ def int8(model: onnx.ModelProto) -> onnx.ModelProto:
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     with tempfile.TemporaryDirectory() as directory:
-        before, after = Path(directory) / "before.onnx", Path(directory) / "after.onnx"
+        file = Path(directory) / "int8.onnx"
         marked = onnx.ModelProto()
         marked.CopyFrom(model)
         # Shapes are inferred and there is nothing to fuse: without this mark, advice to do so is logged.
-        helper.set_model_props(
-            marked, {p.key: p.value for p in model.metadata_props} | {"onnx.quant.pre_process": "onnxruntime.quant"}
-        )
-        onnx.save(marked, before)
-        quantize_dynamic(before, after, weight_type=QuantType.QInt8, op_types_to_quantize=_QUANTISED)
-        small = onnx.load(after)
+        marked.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")
+        quantize_dynamic(marked, file, weight_type=QuantType.QInt8, op_types_to_quantize=_QUANTISED)
+        small = onnx.load(file)
     onnx.checker.check_model(small, full_check=True)
     return small

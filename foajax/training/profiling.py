@@ -19,7 +19,7 @@ from foajax.learning.agent import Agent
 from foajax.learning.learner import loss
 from foajax.learning.programs import empty_rollout, make_programs, make_state
 from foajax.training.collector import Collector, update_on
-from foajax.types import SCREEN_SHAPE, TimeStep
+from foajax.types import TimeStep
 
 _WARM_UP, _ROLLOUTS = 3, 5
 
@@ -79,9 +79,8 @@ def flops_a_step(agent: Agent) -> dict[str, float]:
 
     Counted on few images and scaled up.
     """
-    shape = agent.config.env.frame_shape if agent.crop_top is None else SCREEN_SHAPE
     false = np.zeros(1, bool)
-    timestep = TimeStep(np.zeros((1, *shape), np.uint8), np.zeros(1, np.float32), false, false)
+    timestep = TimeStep(np.zeros((1, *agent.screen_shape), np.uint8), np.zeros(1, np.float32), false, false)
     rollout = jax.eval_shape(lambda: empty_rollout(agent, 1, timestep))
     rows, counted = agent.config.learner.rollout_length + 1, 3
     short = rollout._replace(

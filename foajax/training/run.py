@@ -122,7 +122,9 @@ class Run:
         metrics: list[Metrics] = []
         while at.env_steps < config.train.env_steps and not self._is_to_stop(stop):
             if self._job.count > 1:
-                self._stay_in_touch(compiled=bool(metrics))
+                if metrics:  # nothing is left to compile
+                    self._watch.beat()
+                self._saving.refresh_copy(at)
             own, outcomes = self._collector.collect(self._nearby(at.state), self._step())
             outcomes, games = self._exchange(outcomes, stop)
             self._track(outcomes)
@@ -161,12 +163,6 @@ class Run:
         """How many steps each environment has made, below 0 while a run observes; seeds what is sampled."""
         observing = self._to_observe * self._config.learner.rollout_length
         return self.progress.env_steps // self._config.env.num_envs - observing
-
-    def _stay_in_touch(self, *, compiled: bool) -> None:
-        """Tells the watch that this process lives, once nothing is left to compile, and renews what it would save."""
-        if compiled:
-            self._watch.beat()
-        self._saving.refresh_copy(self.progress)
 
     def _exchange(
         self, outcomes: list[list[Outcome]], stop: StopRequest

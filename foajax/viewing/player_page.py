@@ -9,6 +9,7 @@ for games in full motion; a browser cannot show any frame of one at once, nor ex
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import math
 import zlib
@@ -36,7 +37,7 @@ def write_page(recording: Recording, directory: Path) -> Path:
     """Writes the page of one game; returns its path."""
     page = (Path(__file__).parent / "player.html").read_text(encoding="utf-8")
     text = json.dumps(encode(recording), separators=(",", ":")).replace("<", "\\u003c")  # no tag may end the script
-    title = f"{recording.config.name} on {recording.config.game}".replace("<", "")
+    title = recording.title.replace("<", "")
     file = directory / PAGE
     durable.replace(file, page.replace("{{title}}", title).replace("{{recording}}", text).encode())
     return file
@@ -50,10 +51,9 @@ def encode(recording: Recording) -> dict[str, Any]:
     painting = tables(sensor, config.env.frame_shape)
     shape, origin = _shrunk(recording), recording.frame_origin
     scale = shape[0] / recording.screens.shape[0], shape[1] / recording.screens.shape[1]
-    policy = "likeliest actions" if recording.greedy else "sampled actions"
     return {
-        "title": f"{config.name} on {config.game}",
-        "about": f"{recording.env_steps:,} env_steps of training, {policy}, game {recording.seed}",
+        "title": recording.title,
+        "about": recording.about,
         "steps": len(recording.screens),
         "steps_per_second": steps_per_second(config),
         "screen_shape": shape,
@@ -67,7 +67,7 @@ def encode(recording: Recording) -> dict[str, Any]:
         "images": [part.shape[1:3] for part in recording.images],
         "count": values.shape[1],
         "channels": math.prod(config.env.pixel_shape),
-        "white": max(int(values.max()), 1),
+        "white": recording.white,
         "painting": {"window": painting.window.tolist(), "background": painting.background.tolist()},
         "part": _PART,
         "palette": palette,
@@ -118,20 +118,10 @@ def _screens(recording: Recording) -> tuple[list[list[int]], Iterator[str]]:
 
 def _parts(screens: Iterator[np.ndarray]) -> Iterator[str]:
     """Indices [h, w] of one screen after the other, XORed with the one before, `_PART` at a time."""
-    part: list[np.ndarray] = []
-    for screen in screens:
-        part.append(screen)
-        if len(part) == _PART:
-            yield _pack_part(part)
-            part = []
-    if part:
-        yield _pack_part(part)
-
-
-def _pack_part(part: list[np.ndarray]) -> str:
-    screens = np.stack(part)
-    screens[1:] ^= screens[:-1].copy()
-    return _pack(screens)
+    while some := list(itertools.islice(screens, _PART)):
+        part = np.stack(some)
+        part[1:] ^= part[:-1].copy()
+        yield _pack(part)
 
 
 def _exact_palette(recording: Recording) -> np.ndarray | None:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from scipy.special import softmax
 
 from foajax.config.schema import Config
 from foajax.envs.atari import is_atari
@@ -83,6 +84,22 @@ class Recording(NamedTuple):
         """All images of each step, laid end to end."""
         parts = [part.reshape(len(part), -1, *self.config.env.pixel_shape) for part in self.images]
         return np.concatenate(parts, axis=1)
+
+    @property
+    def white(self) -> int:
+        """The largest of `values`, at least 1: drawn white throughout the game, so that nothing flickers."""
+        return max(1, *(int(part.max()) for part in self.images))
+
+    @property
+    def title(self) -> str:
+        """The experiment and the game."""
+        return f"{self.config.name} on {self.config.game}"
+
+    @property
+    def about(self) -> str:
+        """How the agent came to play like this, in one line."""
+        policy = "likeliest actions" if self.greedy else "sampled actions"
+        return f"{self.env_steps:,} env_steps of training, {policy}, game {self.seed}"
 
     @property
     def life_lost(self) -> np.ndarray:
@@ -226,19 +243,14 @@ def _columns(rows: Sequence[_Row]) -> dict[str, Any]:
     return {
         "focal_point": column(outputs, "focal_point"),
         "images": tuple(np.stack(part) for part in zip(*images, strict=True)),
-        "natural_probs": _softmax(column(networks, "natural_logits")),
+        "natural_probs": softmax(column(networks, "natural_logits"), axis=-1),
         "natural_value": column(networks, "natural_value"),
         "natural_action": column(outputs, "natural_action"),
-        "vision_probs": _softmax(column(networks, "vision_logits")) if learned else None,
+        "vision_probs": softmax(column(networks, "vision_logits"), axis=-1) if learned else None,
         "vision_value": column(networks, "vision_value") if learned else None,
         "vision_action": column(outputs, "vision_action"),
         "is_first": column(outputs, "is_first"),
     }
-
-
-def _softmax(logits: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
-    exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    return exponentials / exponentials.sum(axis=-1, keepdims=True)
 
 
 def _rgb(screen: np.ndarray) -> np.ndarray:

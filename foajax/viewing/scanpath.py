@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Int, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from foajax.sensors.reconstruct import paint, tables
 from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
-from foajax.viewing.style import NATURAL, RINGS, VISION, draw_gaze
+from foajax.viewing.style import FAINT, INK, NATURAL, PAPER, RINGS, VISION, brighten, draw_gaze, enlarge, fit, font
 
-_PAPER, _INK, _FAINT = "#12161b", "#e8edf2", "#8b98a5"
 _SIDE = 640  # of the scene, at most
 _MARGIN = 16
 _TOP = 44  # of the pictures
@@ -42,15 +41,15 @@ def draw_scanpath(recording: Recording) -> Image.Image:
     tiles = _tiles(recording, points, stays)
     rows = -(-len(tiles) // _ACROSS)
     width = 3 * _MARGIN + scene.width + min(_ACROSS, len(tiles)) * (_TILE + 8)
-    image = Image.new("RGB", (width, _TOP + _MARGIN + max(scene.height, rows * (_TILE + 26))), _PAPER)
+    image = Image.new("RGB", (width, _TOP + _MARGIN + max(scene.height, rows * (_TILE + 26))), PAPER)
     pen = ImageDraw.Draw(image)
-    pen.text((_MARGIN, 12), _title(recording, len(stays), length), fill=_INK, font=_font(16))
+    pen.text((_MARGIN, 12), _title(recording, len(stays), length), fill=INK, font=font(16))
     image.paste(scene, (_MARGIN, _TOP))
     for i, tile in enumerate(tiles):
         left = 2 * _MARGIN + scene.width + (i % _ACROSS) * (_TILE + 8)
         top = _TOP + (i // _ACROSS) * (_TILE + 26)
         again = f", {stays[i][1]} decisions" if stays[i][1] > 1 else ""
-        pen.text((left, top - 2), f"{i + 1}{again}", fill=_FAINT, font=_font(12))
+        pen.text((left, top - 2), f"{i + 1}{again}", fill=FAINT, font=font(12))
         image.paste(tile, (left, top + 16))
     return image
 
@@ -58,8 +57,7 @@ def draw_scanpath(recording: Recording) -> Image.Image:
 def _title(recording: Recording, count: int, length: int) -> str:
     action = recording.actions[int(recording.natural_action[max(length - 2, 0)])]
     places = f"{count} fixation{'s' if count > 1 else ''}"
-    names = f"{recording.config.name} on {recording.config.game}"
-    return f"{names}: {places}, then '{action}', {recording.score[length - 1]:+.2f}"
+    return f"{recording.title}: {places}, then '{action}', {recording.score[length - 1]:+.2f}"
 
 
 def _scene(
@@ -69,13 +67,10 @@ def _scene(
     stays: Sequence[tuple[int, int]],
 ) -> Image.Image:
     """The screen enlarged, the path as a line, a number where the gaze rested, the last focal areas outlined."""
-    longest = max(screen.shape[:2])
-    scale = float(_SIDE // longest) if longest <= _SIDE else _SIDE / longest
-    size = round(scale * screen.shape[1]), round(scale * screen.shape[0])
-    image = Image.fromarray(screen).resize(size, Image.Resampling.NEAREST)
+    scale = fit(screen.shape[:2], (_SIDE, _SIDE))
+    image = enlarge(Image.fromarray(screen), scale)
     top, down, across = (scale * part for part in recording.frame_origin)
-    point = (int(points[-1][0]), int(points[-1][1]))
-    draw_gaze(image, make_sensor(recording.config.sensor), point, scale=(down, across), top=top, halo=True)
+    draw_gaze(image, make_sensor(recording.config.sensor), points[-1], scale=(down, across), top=top, halo=True)
     pen = ImageDraw.Draw(image)
     box = (recording.facts or {}).get("box")
     if box is not None and box[2] > 0:
@@ -87,8 +82,8 @@ def _scene(
         pen.line(places, fill=VISION, width=2)
     for number, (x, y) in enumerate(places, 1):
         rim = RINGS[0] if number == len(places) else VISION
-        pen.ellipse([x - 9, y - 9, x + 9, y + 9], fill=_PAPER, outline=rim, width=2)
-        pen.text((x, y), str(number), fill=_INK, font=_font(11), anchor="mm")
+        pen.ellipse([x - 9, y - 9, x + 9, y + 9], fill=PAPER, outline=rim, width=2)
+        pen.text((x, y), str(number), fill=INK, font=font(11), anchor="mm")
     return image
 
 
@@ -97,18 +92,12 @@ def _tiles(recording: Recording, points: Int[np.ndarray, "N 2"], stays: Sequence
     sensor = make_sensor(recording.config.sensor).packed
     frame_shape = recording.config.env.frame_shape
     painting = tables(sensor, frame_shape)
-    values = recording.values
-    white = max(int(values.max()), 1)
+    values, white = recording.values, recording.white
     shown = sensor.areas[min(1, len(sensor.areas) - 1)]
     tiles = []
     for first, _ in stays:
         picture = np.pad(paint(values[first], points[first], painting), [(side // 2, side // 2) for side in shown])
         y, x = (int(p) for p in points[first])
-        cut = picture[y : y + shown[0], x : x + shown[1]].astype(np.uint16) * 255 // white
-        tile = Image.fromarray(cut.astype(np.uint8)).convert("RGB")
+        tile = brighten(picture[y : y + shown[0], x : x + shown[1]], white)
         tiles.append(tile.resize((_TILE, _TILE), Image.Resampling.NEAREST))
     return tiles
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)

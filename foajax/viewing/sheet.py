@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from PIL import Image, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageDraw, ImageOps
 
 from foajax.config.parse import refuse
 from foajax.sensors.base import Sensor
 from foajax.sensors.sense import picture, sense
-from foajax.viewing.style import draw_gaze
+from foajax.viewing.style import draw_gaze, font
 
 PAPER = (
     "nonfoa",
@@ -30,6 +30,7 @@ ALL = (*PAPER, "logpolar")
 _SIDE = 240  # of a panel, pixels: about three for each of an 80x80 frame
 _GAP = 12
 _LINE = 18  # of text
+_ACROSS, _DOWN = 0, 1  # axes of an image's size
 _INK, _FAINT, _PAPER = "#222222", "#777777", "#ffffff"
 
 Panel = tuple[str, Image.Image]  # caption and picture
@@ -45,19 +46,19 @@ def draw(frame: np.ndarray, sensor: Sensor, points: Sequence[tuple[int, int]], *
       name: of the sensor, for the heading.
     """
     rows = [_row(_panels(frame, sensor, point)) for point in points]
-    return _headed(_stack(rows), *_heading(frame, sensor, name))
+    return _headed(_join(rows, _DOWN), *_heading(frame, sensor, name))
 
 
 def contact_sheet(frame: np.ndarray, sensors: dict[str, Sensor], points: Sequence[tuple[int, int]]) -> Image.Image:
     """Several sensors on one frame, two abreast; each with a pair of panels for every focal point."""
     blocks = [
         _headed(
-            _stack([_row(_panels(frame, sensor, point)[:2]) for point in points]),
+            _join([_row(_panels(frame, sensor, point)[:2]) for point in points], _DOWN),
             *_heading(frame, sensor, name),
         )
         for name, sensor in sensors.items()
     ]
-    return _stack([_beside(blocks[i : i + 2]) for i in range(0, len(blocks), 2)])
+    return _join([_join(blocks[i : i + 2], _ACROSS) for i in range(0, len(blocks), 2)], _DOWN)
 
 
 def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[Panel]:
@@ -105,15 +106,15 @@ def _image(values: np.ndarray) -> Image.Image:
 
 def _row(panels: Sequence[Panel]) -> Image.Image:
     """Panels side by side, each under its caption."""
-    font, blocks = ImageFont.load_default(12), []
+    blocks = []
     for caption, image in panels:
-        width = max(image.width + 2, round(font.getlength(caption)))
+        width = max(image.width + 2, round(font(12).getlength(caption)))
         block = Image.new("RGB", (width, image.height + 2 + _LINE), _PAPER)
-        ImageDraw.Draw(block).text((0, 0), caption, fill=_FAINT, font=font)
+        ImageDraw.Draw(block).text((0, 0), caption, fill=_FAINT, font=font(12))
         # White pixels are to end somewhere on a white page.
         block.paste(ImageOps.expand(image, 1, _FAINT), (0, _LINE))
         blocks.append(block)
-    return _beside(blocks)
+    return _join(blocks, _ACROSS)
 
 
 def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
@@ -125,7 +126,7 @@ def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
 
 def _headed(image: Image.Image, title: str, note: str) -> Image.Image:
     """An image under a heading."""
-    large, small = ImageFont.load_default(16), ImageFont.load_default(12)
+    large, small = font(16), font(12)
     start = round(large.getlength(title)) + _GAP
     width = max(image.width, start + round(small.getlength(note)))
     headed = Image.new("RGB", (width, image.height + _LINE + _GAP // 2), _PAPER)
@@ -136,25 +137,14 @@ def _headed(image: Image.Image, title: str, note: str) -> Image.Image:
     return headed
 
 
-def _beside(images: Sequence[Image.Image]) -> Image.Image:
-    """Images from left to right, their tops aligned."""
-    width = sum(image.width for image in images) + _GAP * (len(images) - 1)
-    joined = Image.new("RGB", (width, max(image.height for image in images)), _PAPER)
-    left = 0
+def _join(images: Sequence[Image.Image], axis: int) -> Image.Image:
+    """Images from left to right with their tops aligned, or from top to bottom."""
+    size = [max(sides) for sides in zip(*(image.size for image in images), strict=True)]
+    size[axis] = sum(image.size[axis] for image in images) + _GAP * (len(images) - 1)
+    joined, place = Image.new("RGB", (size[0], size[1]), _PAPER), [0, 0]
     for image in images:
-        joined.paste(image, (left, 0))
-        left += image.width + _GAP
-    return joined
-
-
-def _stack(images: Sequence[Image.Image]) -> Image.Image:
-    """Images from top to bottom."""
-    height = sum(image.height for image in images) + _GAP * (len(images) - 1)
-    joined = Image.new("RGB", (max(image.width for image in images), height), _PAPER)
-    top = 0
-    for image in images:
-        joined.paste(image, (0, top))
-        top += image.height + _GAP
+        joined.paste(image, (place[0], place[1]))
+        place[axis] += image.size[axis] + _GAP
     return joined
 
 

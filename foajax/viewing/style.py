@@ -1,16 +1,20 @@
-"""What every picture of the gaze shares: colours, and the outlines of the focal areas."""
+"""What pictures of the gaze share: colours, fonts, scales, and the outlines of the focal areas."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
-from PIL import Image, ImageDraw
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
 
 from foajax.sensors.base import Sensor, boxes
 
 RINGS = ("#ffb000", "#2fb8ff", "#ff5c9a")  # inner to outer, told apart by the colour-blind too
 NATURAL, VISION = "#58d68d", "#b794ff"  # the two heads
 HALO = "#000000"  # under a line that has to show on any screen
+PAPER, PANEL, INK, FAINT = "#12161b", "#1b2128", "#e8edf2", "#8b98a5"  # of dark pictures
 
 Number = int | float
 
@@ -26,14 +30,13 @@ STYLE: Any = {  # of figures: Matplotlib's keys
     "xtick.labelcolor": "#222222",
     "ytick.labelcolor": "#222222",
     "legend.frameon": False,
-    "svg.hashsalt": "foajax",  # the same figure, the same file
 }
 
 
 def draw_gaze(
     image: Image.Image,
     sensor: Sensor,
-    point: tuple[int, int],
+    point: np.ndarray | tuple[int, int],
     *,
     scale: tuple[Number, Number],
     top: Number = 0,
@@ -62,3 +65,26 @@ def draw_gaze(
     for reach, width, colour in ((6, 4, HALO), (5, 2, RINGS[0])) if halo else ((5, 2, RINGS[0]),):
         pen.line([x - reach, y, x + reach, y], fill=colour, width=width)
         pen.line([x, y - reach, x, y + reach], fill=colour, width=width)
+
+
+@functools.cache
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Pillow's own, at a size in pixels."""
+    return ImageFont.load_default(size)
+
+
+def fit(shape: tuple[int, ...], room: tuple[int, int]) -> float:
+    """The scale at which a picture fits: a whole number, unless it has to shrink."""
+    scale = min(limit / size for limit, size in zip(room, shape, strict=True))
+    return float(int(scale)) if scale >= 1 else scale
+
+
+def enlarge(image: Image.Image, scale: float) -> Image.Image:
+    """An image at a scale: enlarged in squares, shrunk to means."""
+    how = Image.Resampling.NEAREST if scale >= 1 else Image.Resampling.BOX
+    return image.resize((round(scale * image.width), round(scale * image.height)), how)
+
+
+def brighten(values: UInt8[np.ndarray, "h w *C"], white: int) -> Image.Image:
+    """Values [h, w] or [h, w, 3] as an RGB image in which `white` is drawn white."""
+    return Image.fromarray((values.astype(np.uint16) * 255 // white).astype(np.uint8)).convert("RGB")

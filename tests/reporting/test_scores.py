@@ -37,7 +37,7 @@ def test_an_interval_is_the_quantiles_of_all_resamples():
         for first in itertools.product(strata[0], repeat=2)
         for second in itertools.product(strata[1], repeat=2)
     ]
-    found = interval(strata, np.mean, resamples=20_000)
+    found = interval(strata, np.mean)
     assert found.value == pytest.approx(6.25)
     assert (found.low, found.high) == (min(means), max(means)) == (5.0, 7.5)  # each in 1 of 16, more than 2.5 %
 
@@ -51,8 +51,8 @@ def test_the_interval_of_a_mean_is_that_of_theory():
     """Sixty-four scores of deviation 8: the mean's deviation is 1, its 95 % interval +- 1.96."""
     scores = np.random.default_rng(1).normal(size=64)
     scores = 100 + 8 * (scores - scores.mean()) / scores.std()
-    found = interval([scores], np.mean, resamples=20_000)
-    assert found.low == pytest.approx(100 - 1.96, abs=0.1) and found.high == pytest.approx(100 + 1.96, abs=0.1)
+    found = interval([scores], np.mean)
+    assert found.low == pytest.approx(100 - 1.96, abs=0.2) and found.high == pytest.approx(100 + 1.96, abs=0.2)
 
 
 def test_normalised_scores():
@@ -61,5 +61,6 @@ def test_normalised_scores():
 
 
 def test_how_an_interval_is_written():
-    assert str(Interval(12.345678, 10.0, 15.5)) == "12.35 [10, 15.5]"
+    assert str(Interval(12.345678, 10.0, 15.5)) == "12.3 [10, 15.5]"
+    assert str(Interval(12345.6, 999.0, np.inf)) == "12,346 [999, inf]"
     assert str(Interval(3.0, 3.0, 3.0)) == "3"

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from foajax.config.compose import compose
-from foajax.reporting import kept, results, search
+from foajax.reporting import claims, kept, results, search
 from foajax.reporting.curves import RunData
 from foajax.reporting.markdown import fill
 
@@ -56,7 +56,7 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
         "Detection (seeds: 1): the return is 0.5, with 5 decisions. The share of right answers is 0.99, that of" in text
     )
     tables = (search._SENSORS, search._GAZES, search._TARGETS)
-    assert text.count(search._NOT_RUN) == sum(map(len, tables)) - 4
+    assert text.count(claims.NOT_RUN) == sum(map(len, tables)) - 4
     rows = [line for line in text.splitlines() if line.startswith(("| 160x160", "| 1080x1920"))]
     ratios = [float(row.split("|")[-2].replace(",", "")) for row in rows]
     assert len(ratios) == 2 and 1 < ratios[0] < ratios[1] and ratios[1] > 50
