@@ -69,37 +69,31 @@ def loss(
     mask_t = 1.0 - steps.is_first[1:].astype(jnp.float32)  # the step after an episode's end is nobody's
     transitions = (steps.reward[1:], is_terminal_t, mask_t)
 
-    heads = [_natural_targets(config.natural, *transitions, output.natural_value)]
+    per_environment = functools.partial(jax.vmap, in_axes=1, out_axes=1)
+    natural = functools.partial(_natural_targets, config.natural)
+    heads = {"natural": per_environment(natural)(*transitions, output.natural_value)}
     if output.vision_value is not None:
-        heads.append(_vision_targets(config, *transitions, output.vision_value))
-    masks = [(targets.policy_mask_t, targets.value_mask_t) for targets in heads]
+        vision = functools.partial(_vision_targets, config)
+        heads["vision"] = per_environment(vision)(*transitions, output.vision_value)
+    masks = [(targets.policy_mask_t, targets.value_mask_t) for targets in heads.values()]
     valid = _whole(jnp.stack([jnp.stack([losses.valid_steps(mask) for mask in pair]) for pair in masks]), axis)
-    total, metrics = _head_loss(
-        config,
-        config.natural,
-        heads[0],
-        valid[0],
-        logits=output.natural_logits[:-1],
-        value=output.natural_value[:-1],
-        action=steps.natural_action[:-1],
-        behaviour_log_prob=steps.natural_log_prob[:-1],
-        axis=axis,
-    )
-    metrics = {f"natural_{name}": value for name, value in metrics.items()}
-    if output.vision_logits is not None and output.vision_value is not None:
-        vision_total, vision_metrics = _head_loss(
+    totals, metrics = {}, {}
+    for i, (name, targets) in enumerate(heads.items()):
+        totals[name], found = _head_loss(
             config,
-            config.vision,
-            heads[1],
-            valid[1],
-            logits=output.vision_logits[:-1],
-            value=output.vision_value[:-1],
-            action=steps.vision_action[:-1],
-            behaviour_log_prob=steps.vision_log_prob[:-1],
+            getattr(config, name),
+            targets,
+            valid[i],
+            logits=getattr(output, f"{name}_logits")[:-1],
+            value=getattr(output, f"{name}_value")[:-1],
+            action=getattr(steps, f"{name}_action")[:-1],
+            behaviour_log_prob=getattr(steps, f"{name}_log_prob")[:-1],
             axis=axis,
         )
-        total = total + config.vision_weight * vision_total
-        metrics |= {f"vision_{name}": value for name, value in vision_metrics.items()}
+        metrics |= {f"{name}_{metric}": value for metric, value in found.items()}
+    total = totals["natural"]
+    if "vision" in totals:
+        total = total + config.vision_weight * totals["vision"]
     return total, metrics | {"loss": total}
 
 
@@ -112,33 +106,28 @@ class Targets(NamedTuple):
     value_mask_t: Float[Array, "T B"]  # and the value's
 
 
-def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
-    def one(r_t, is_terminal_t, mask_t, v):
-        discount_t = head.gamma * (1.0 - is_terminal_t)
-        return Targets(
-            returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
-            advantages=returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda),
-            policy_mask_t=mask_t,
-            value_mask_t=mask_t,
-        )
-
-    return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
+def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, v: Array) -> Targets:
+    """Of one environment; every field is [T]."""
+    discount_t = head.gamma * (1.0 - is_terminal_t)
+    return Targets(
+        returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
+        advantages=returns.generalized_advantages(r_t, discount_t, mask_t, v[:-1], v[1:], head.gae_lambda),
+        policy_mask_t=mask_t,
+        value_mask_t=mask_t,
+    )
 
 
-def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, value: Array) -> Targets:
+def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, v: Array) -> Targets:
+    """Of one environment; every field is [T]."""
     head = config.vision
-
-    def one(r_t, is_terminal_t, mask_t, v):
-        stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
-        credited = returns.vision_stream(r_t, is_terminal_t, mask_t, credits_last=config.credits_last_gaze)
-        return Targets(
-            returns=returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap),
-            advantages=returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda),
-            policy_mask_t=credited.policy_mask_t,
-            value_mask_t=credited.value_mask_t,
-        )
-
-    return jax.vmap(one, in_axes=1, out_axes=1)(r_t, is_terminal_t, mask_t, value)
+    stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
+    credited = returns.vision_stream(r_t, is_terminal_t, mask_t, credits_last=config.credits_last_gaze)
+    return Targets(
+        returns=returns.vision_returns(*stream, v[1:], bootstrap=config.vision_bootstrap),
+        advantages=returns.vision_advantages(*stream, v[:-1], v[1:], head.gae_lambda),
+        policy_mask_t=credited.policy_mask_t,
+        value_mask_t=credited.value_mask_t,
+    )
 
 
 def _head_loss(
@@ -234,14 +223,17 @@ def observe(state: TrainState, rollout: Rollout, *, axis: str | None = None) -> 
 
     The deviation begins anew: what was measured from means that were not known yet is forgotten.
     """
-    count = rollout.steps.is_first[:-1].size
-    frame_mean, frame_std = (jnp.mean(x[:-1], (0, 1)) for x in rollout.steps.frames)
-    if axis:
-        shards = jax.lax.axis_size(axis)
-        frame_mean, frame_std = _whole((frame_mean / shards, frame_std / shards), axis)
-        count *= shards
+    averages, count = _frame_averages(rollout, axis)
+    frame_mean, frame_std = _whole(averages, axis)
     statistics = frames.update_statistics(state.statistics, frame_mean, frame_std, count)
     return state._replace(statistics=statistics._replace(std=frame_std * statistics.weight))
+
+
+def _frame_averages(rollout: Rollout, axis: str | None) -> tuple[tuple[Array, Array], int]:
+    """A device's part of the mean and the deviation of a rollout's frames, and how many these are on all devices."""
+    shards = jax.lax.axis_size(axis) if axis else 1
+    mean, std = (jnp.mean(x[:-1], (0, 1)) / shards for x in rollout.steps.frames)
+    return (mean, std), rollout.steps.is_first[:-1].size * shards
 
 
 def update(
@@ -266,14 +258,9 @@ def update(
     metrics are those of the whole, the same on every device.
     """
     part = minibatch(rollout, index, size)
-    frames_seen = part.steps.is_first[:-1].size
-    frame_mean, frame_std = (jnp.mean(x[:-1], (0, 1)) for x in part.steps.frames)
+    averages, frames_seen = _frame_averages(part, axis)
     results = jax.grad(loss, has_aux=True)(state.params, agent, part, axis=axis)
-    if axis:
-        shards = jax.lax.axis_size(axis)
-        results, frame_mean, frame_std = _whole((results, frame_mean / shards, frame_std / shards), axis)
-        frames_seen *= shards
-    gradient, metrics = results
+    (gradient, metrics), (frame_mean, frame_std) = _whole((results, averages), axis)
     metrics = _summed_up(metrics)
     grad_norm = optax.tree.norm(gradient)
     accept = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)

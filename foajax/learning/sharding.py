@@ -45,11 +45,10 @@ class Layout:
 
     def join(self, rollout: Rollout) -> Rollout:
         """The processes' rollouts as one."""
-        specs = Rollout(
-            steps=jax.tree.map(lambda _: ROLLOUT.steps, rollout.steps),
-            core_state=jax.tree.map(lambda _: ROLLOUT.core_state, rollout.core_state),
+        return Rollout(
+            steps=jax.tree.map(lambda x: self._join(x, ROLLOUT.steps), rollout.steps),
+            core_state=jax.tree.map(lambda x: self._join(x, ROLLOUT.core_state), rollout.core_state),
         )
-        return jax.tree.map(self._join, rollout, specs)
 
     def _join(self, x: Array, spec: PartitionSpec) -> Array:
         axis = tuple(spec).index(DATA)
