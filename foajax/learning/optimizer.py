@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Int
 
-from foajax.config.parse import refuse
 from foajax.config.schema import LearnerConfig
 from foajax.types import Params
 
@@ -39,10 +38,8 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
     further, the more inputs it has (Yang et al. 2022, table 3).
 
     `update` takes one argument more than Optax's: with `accept=False` the gradient, whatever it holds, changes
-    nothing and the update is 0. Raises `ConfigError` where `total_updates` is below 1.
+    nothing and the update is 0.
     """
-    if total_updates < 1:
-        raise refuse("total_updates", total_updates, "an integer >= 1")
     most, b1, b2 = learner.max_grad_norm, learner.adam_b1, learner.adam_b2
     clip = optax.identity() if most is None else optax.clip_by_global_norm(most)
     adam = optax.scale_by_adam(b1, b2, learner.adam_eps)
