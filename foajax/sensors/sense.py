@@ -26,18 +26,9 @@ def sense(
     sensor: SensorConfig | Sensor,
     bounds: str = "point",
 ) -> tuple[Float[Array, "_ _ _"], ...]:
-    """What the sensor sees of a frame: float32 images [h, w, c], one a part; a gray frame has one channel.
+    """What a sensor sees of one frame; arguments, results and errors are those of `foajax.sense`.
 
-    Args:
-      frame: uint8 or finite float, in any range and of any size.
-      focal_point: (y, x), frame pixels.
-      sensor: static; see `foajax.sensors.rings`, `foajax.sensors.logpolar` and, for one's own, `foajax.sensors.base`.
-      bounds: static, as in `foajax.sensors.gaze`. With 'point' the area may overhang the frame; with 'window' it is
-        moved inside where it would, and then sensing takes about two thirds of the time.
-
-    Raises:
-      ConfigError: a frame or a focal point of another rank; a focal point of fractions; a peripheral grid finer than
-        the frame; other bounds, or 'window' and an area larger than the frame.
+    `sensor` and `bounds` are static.
     """
     sensor = make_sensor(sensor)
     frame, point = jnp.asarray(frame), jnp.asarray(focal_point)
@@ -56,9 +47,6 @@ def picture(
     sensor: SensorConfig | Sensor,
     frame_shape: Shape,
 ) -> Float[Array, "H W C"]:
-    """What `sense` gave, put back in the frame's place; 0 where nothing was seen.
-
-    `focal_point` is where the area lay: with bounds 'window', the point after it was moved inside.
-    """
+    """What `sense` gave, put back in the frame's place; as `foajax.picture`."""
     gray = functools.partial(make_sensor(sensor).picture, focal_point=focal_point, frame_shape=frame_shape)
     return jax.vmap(gray, in_axes=2, out_axes=2)(images)
