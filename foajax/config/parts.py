@@ -16,33 +16,17 @@ def is_code(name: str) -> bool:
     return ":" in name
 
 
-def find_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
-    """What makes the part that `key=name` asks for. A name of code imports its module: only what the user trusts.
-
-    Raises:
-      ConfigError: there is no such word, module or name in the module.
-    """
-    if not is_code(name):
-        if name not in ours:
-            raise refuse(key, name, (*ours, "package.module:Name"))
-        return ours[name]
-    module, _, path = name.partition(":")
-    try:
-        found: Any = functools.reduce(getattr, path.split("."), importlib.import_module(module))
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise refuse(key, name, f"package.module:Name ({one_line(error)})") from None
-    if not callable(found):
-        raise refuse(key, name, "package.module:Name of something to call")
-    return found
-
-
 def bind_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> functools.partial:
-    """What makes the part with these arguments, once it is called.
+    """What makes the part that `key=name` asks for, with these arguments, once it is called.
+
+    A name of code imports its module: only what the user trusts.
 
     Raises:
-      ConfigError: as `find_part` does, or it takes other arguments than these.
+      ConfigError: there is no such word, module or name in the module, or it takes other arguments than these.
     """
-    make = find_part(key, name, ours)
+    if not is_code(name) and name not in ours:
+        raise refuse(key, name, (*ours, "package.module:Name"))
+    make = _import(key, name) if is_code(name) else ours[name]
     try:
         inspect.signature(make).bind(**arguments)
     except TypeError as error:
@@ -54,3 +38,14 @@ def bind_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **
 def make_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> Any:
     """The part itself; `ConfigError` as of `bind_part`."""
     return bind_part(key, name, ours, **arguments)()
+
+
+def _import(key: str, name: str) -> Callable[..., Any]:
+    module, _, path = name.partition(":")
+    try:
+        found: Any = functools.reduce(getattr, path.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise refuse(key, name, f"package.module:Name ({one_line(error)})") from None
+    if not callable(found):
+        raise refuse(key, name, "package.module:Name of something to call")
+    return found
