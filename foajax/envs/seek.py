@@ -51,16 +51,6 @@ def task(frame_shape: tuple[int, int]) -> Task:
     )
 
 
-def optimal_return() -> float:
-    """The return of who sees the stripes at every step: one point a leg."""
-    return float(LEGS)
-
-
-def random_return() -> float:
-    """The expected return of who never sees the stripes, whatever the policy: right half of the time."""
-    return 0.0
-
-
 def current_kind(state: SeekState) -> Int[Array, ""]:
     """The action, and stripes, that are right now: LEAVE or TAKE."""
     return state.kind[jnp.minimum(state.time // LEG, LEGS - 1)]
