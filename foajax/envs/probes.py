@@ -96,13 +96,7 @@ def gaze(frame_shape: tuple[int, int]) -> Task:
 
 
 PROBES: dict[str, Callable[[tuple[int, int]], Task]] = {
-    "constant": constant,
-    "observation": observation,
-    "delay": delay,
-    "action": action,
-    "match": match,
-    "memory": memory,
-    "gaze": gaze,
+    probe.__name__: probe for probe in (constant, observation, delay, action, match, memory, gaze)
 }
 
 
