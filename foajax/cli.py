@@ -111,7 +111,7 @@ def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str]
     words = sys.argv[1:] if arguments is None else arguments
     module = sys.modules[command.__module__]
     if not {"-h", "--help"}.isdisjoint(words) and hasattr(module, "Options"):
-        print(_help(module))
+        print(f"{inspect.cleandoc(module.__doc__ or '')}\n\n{listed(module.Options)}")
         return 0
     try:
         return command(words) or 0
@@ -125,10 +125,6 @@ def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str]
         why = f"{error.filename or 'its files'}: cannot be written ({error.strerror})"
     print(f"foajax: error: {why}", file=sys.stderr)
     return 2
-
-
-def _help(module: Any) -> str:
-    return f"{inspect.cleandoc(module.__doc__ or '')}\n\n{listed(module.Options)}"
 
 
 def make_directory(out: str | Path) -> Path:

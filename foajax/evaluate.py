@@ -85,7 +85,7 @@ def evaluate(arguments: Sequence[str]) -> None:
         "protocol": protocol,
         "episodes": options.episodes,
         "mean": float(games.returns.mean()),
-        "stderr": standard_error(games.returns),
+        "stderr": float(games.returns.std(ddof=1) / np.sqrt(len(games.returns))) if len(games.returns) > 1 else None,
         "cut": games.cut,
         "measures": summarise(games.facts),
         "returns": games.returns.tolist(),
@@ -94,11 +94,6 @@ def evaluate(arguments: Sequence[str]) -> None:
     if options.json_file:
         cli.write_json("json", options.json_file, result)
     _print(result)
-
-
-def standard_error(returns: np.ndarray) -> float | None:
-    """Of the mean; None for a single game."""
-    return float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else None
 
 
 def _print(result: dict) -> None:

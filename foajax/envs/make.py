@@ -76,14 +76,12 @@ def steps_per_second(config: Config) -> float:
     return 60 / config.env.frame_skip if is_atari(config) else 15.0
 
 
-def environment_seed(seed: int, env_steps: int, group: int) -> int:
-    """Apart for every run, group and start: an engine adds its environments' numbers to one seed."""
-    return int(np.random.SeedSequence([seed, env_steps, group]).generate_state(1)[0] >> 2)
-
-
 def make_environments(config: Config, env_steps: int, index: int = 0, count: int = 1) -> list[Environment]:
     """The groups of environments of a run that starts at `env_steps`: process `index`'s part of each, of `count`."""
-    batch = config.env.num_envs // config.env.num_groups // count
-    # An engine adds an environment's number to its seed: each is seeded alike whatever the number of processes.
-    seeds = [environment_seed(config.seed, env_steps, group) + index * batch for group in range(config.env.num_groups)]
-    return [make(config, num_envs=batch, seed=seed) for seed in seeds]
+    batch, environments = config.env.num_envs // config.env.num_groups // count, []
+    for group in range(config.env.num_groups):
+        # Apart for every run, group and start. An engine adds an environment's number: each is seeded alike whatever
+        # the number of processes.
+        seed = int(np.random.SeedSequence([config.seed, env_steps, group]).generate_state(1)[0] >> 2)
+        environments.append(make(config, num_envs=batch, seed=seed + index * batch))
+    return environments

@@ -58,7 +58,8 @@ class Agent:
     @property
     def network(self) -> networks.Network:
         """The network, without its parameters."""
-        return networks.make_network(self.config, self.num_actions)
+        gaze = self.config.gaze
+        return networks.Network(self.config.network, self.num_actions, gaze.num_actions if gaze.learned else 0)
 
     @property
     def image_shapes(self) -> tuple[tuple[int, int, int], ...]:

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from foajax.config.schema import Config, NetworkConfig
+from foajax.config.schema import NetworkConfig
 from foajax.networks.cores import LSTM, Carry, make_core
 from foajax.networks.torsos import RELU_GAIN, convolution, make_torso
 from foajax.types import NetworkOutput, Params
@@ -97,15 +97,6 @@ class Network(nn.Module):
 def smallest_image(torso: str) -> int:
     """The sides that an image has at least for `torso` to see it; a smaller one goes straight to the next layer."""
     return 12 if torso == "small" else 8
-
-
-def make_network(config: Config, num_natural_actions: int) -> Network:
-    """The network that an experiment asks for."""
-    return Network(
-        config=config.network,
-        num_natural_actions=num_natural_actions,
-        num_vision_actions=config.gaze.num_actions if config.gaze.learned else 0,
-    )
 
 
 def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[int, int, int]], side: int) -> Params:
