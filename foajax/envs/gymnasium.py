@@ -17,6 +17,7 @@ from gymnasium.wrappers import TimeLimit
 
 from foajax.config.parse import brief, one_line, refuse
 from foajax.config.schema import Config
+from foajax.envs.base import first_step
 from foajax.types import Outcome, TimeStep
 
 LUMA = np.array([299, 587, 114])  # thousandths of red, green and blue in gray (ITU-R BT.601)
@@ -68,10 +69,8 @@ class GymnasiumEnvironment:
     def reset(self) -> tuple[TimeStep, Outcome]:
         """Begins all episodes, from the seed."""
         self._image, _ = self._env.reset(seed=self._seed)
-        zeros, false = np.zeros(self.num_envs, np.float32), np.zeros(self.num_envs, bool)
-        self._ended = false
-        timestep = TimeStep(self._frames(self._image), zeros, is_first=~false, is_terminal=false)
-        return timestep, Outcome(score=zeros, is_over=false)
+        self._ended = np.zeros(self.num_envs, bool)
+        return first_step(self._frames(self._image))
 
     def send(self, action: np.ndarray) -> None:
         """Keeps the actions for `recv`."""
