@@ -27,7 +27,7 @@ from foajax.config.shipped import agents
 from foajax.learning.agent import Agent
 from foajax.learning.programs import make_state
 from foajax.runs import durable
-from foajax.runs.checkpoints import Checkpoints
+from foajax.runs.checkpoints import Checkpoints, named_leaves
 from foajax.runs.directory import PARAMETERS, is_run, load_config
 from foajax.runtime import refuse_fork
 from foajax.types import FrameStatistics, Params, TimeStep, TrainState
@@ -182,7 +182,7 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False, key
         return _load_shipped(agent, path / PARAMETERS, facts.get("env_steps", 0))
     template = jax.eval_shape(lambda: make_state(agent, 0))
     checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
-    restored = checkpoints.restore_part({"train": template}, best=best)
+    restored = checkpoints.restore({"train": template}, part=True, best=best)
     if restored is None:
         raise refuse("run", path, "", why="has no checkpoint yet")
     env_steps, state, _ = restored
@@ -262,8 +262,6 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> TrainedAgent:
     return TrainedAgent(agent, params, statistics, env_steps)
 
 
-def named(tree) -> dict:
-    """Leaves by their path, e.g. `0/params/dense/kernel`."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-    return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named.items()}
+def named(tree: Any) -> dict[str, Any]:
+    """Leaves by their path, e.g. `0/params/dense/kernel`; arrays on the host."""
+    return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named_leaves(tree).items()}

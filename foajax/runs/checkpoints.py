@@ -114,7 +114,7 @@ class Checkpoints:
             raise ValueError("these checkpoints were opened for reading only")
         if self._writer is not None and self._writer.is_alive():
             return False
-        leaves = _named_leaves(state)
+        leaves = named_leaves(state)
         for name, leaf in leaves.items():
             if leaf.size == 0:
                 raise ValueError(f"{name} has no elements, which Orbax cannot store")
@@ -139,32 +139,25 @@ class Checkpoints:
     def __exit__(self, *_: object) -> None:
         self.wait()
 
-    def restore(self, template: Any) -> Restored | None:
+    def restore(self, template: Any, *, part: bool = False, best: bool = False) -> Restored | None:
         """The newest usable checkpoint, to go on from; None where there is none at all.
 
         Each one is verified against its checksums and against `template` (a pytree of arrays or
         `jax.ShapeDtypeStruct`; names, shapes and dtypes must agree) before it is used. One that fails is
         reported through `warn` and the one before it is tried. Arrays arrive where the template has them.
 
+        Args:
+          template: what is asked for.
+          part: whether it may leave out arrays that the checkpoint has.
+          best: take the highest ``meta["score"]`` first (among equals, and without one, the newest).
+
         Raises:
           CheckpointError: there are checkpoints, but none can be used.
         """
-        return self._first_usable(template, lambda step: (step,), part=False)
-
-    def restore_part(self, template: Any, *, best: bool = False) -> Restored | None:
-        """Like `restore`, but `template` may leave out arrays that the checkpoint has.
-
-        With `best` the order is by falling ``meta["score"]`` (among equals, and without one, the newest).
-        """
-        if best:
-            return self._first_usable(template, self._score_and_step, part=True)
-        return self._first_usable(template, lambda step: (step,), part=True)
-
-    def _first_usable(self, template: Any, rank: Callable[[int], tuple[float, ...]], *, part: bool) -> Restored | None:
         failed: dict[int, CheckpointError] = {}
         # Listed again after each failure: beside a running writer, old ones go and new ones come.
         while left := [step for step in self.steps() if step not in failed]:
-            step = max(left, key=rank)
+            step = max(left, key=self._score_and_step if best else None)
             try:
                 restored = _read(self.directory / str(step), template, part=part)
             except CheckpointError as error:
@@ -229,7 +222,8 @@ class Checkpoints:
             shutil.rmtree(old)
 
 
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Leaves by their path, e.g. `0/params/dense/kernel`."""
     paths = jax.tree_util.tree_leaves_with_path(tree)
     named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}
     if len(named) != len(paths):
@@ -290,7 +284,7 @@ def _read(path: Path, template: Any, *, part: bool) -> Restored:
             raise CheckpointError(f"its format is {body.get('format')}, this version reads {_FORMAT}")
         if str(body["env_steps"]) != path.name or not isinstance(body["meta"], dict):
             raise CheckpointError("meta.json belongs to another checkpoint")
-        leaves = _named_leaves(template)
+        leaves = named_leaves(template)
         stored = body["leaves"]
         relevant = {name: stored[name] for name in leaves if name in stored} if part else stored
         _compare(relevant, {name: _describe(leaf) for name, leaf in leaves.items()})

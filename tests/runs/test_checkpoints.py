@@ -117,12 +117,12 @@ def test_a_part_comes_back_alone(opened):
     state = make_state(7)
     with opened() as checkpoints:
         checkpoints.save(1, {"train": state, "rest": jnp.zeros(3)}, {})
-    restored = opened(keep=None).restore_part({"train": make_state(1)})
+    restored = opened(keep=None).restore({"train": make_state(1)}, part=True)
     assert_same(restored.state, {"train": state})
     with pytest.raises(CheckpointError, match="rest is float32"):
         opened(keep=None).restore({"train": make_state(1)})
     with pytest.raises(CheckpointError, match="other is missing"):
-        opened(keep=None).restore_part({"other": jnp.zeros(3)})
+        opened(keep=None).restore({"other": jnp.zeros(3)}, part=True)
 
 
 def test_arrays_arrive_where_the_template_has_them(opened):
@@ -182,7 +182,7 @@ def test_meta_that_json_cannot_hold_is_refused(opened):
 
 def test_nothing_there(opened, tmp_path):
     assert opened().restore(small(0)) is None
-    assert opened(keep=None).restore_part(small(0), best=True) is None
+    assert opened(keep=None).restore(small(0), best=True, part=True) is None
     assert not (tmp_path / "run").exists()
 
 
@@ -193,7 +193,7 @@ def test_the_newest_are_kept_and_the_best(opened):
             fill(checkpoints, step, score=score)
         assert checkpoints.steps() == [30, 100, 200]
         assert checkpoints.restore(small(0)).env_steps == 200
-        best = checkpoints.restore_part(small(0), best=True)
+        best = checkpoints.restore(small(0), best=True, part=True)
         assert best.env_steps == 30
         assert_same(best.state, small(30))
 
@@ -201,7 +201,7 @@ def test_the_newest_are_kept_and_the_best(opened):
 def test_without_scores_the_newest_is_the_best(opened):
     with opened() as checkpoints:
         fill(checkpoints, 9, 10)
-        assert checkpoints.restore_part(small(0), best=True).env_steps == 10
+        assert checkpoints.restore(small(0), best=True, part=True).env_steps == 10
 
 
 def test_two_writes_never_run_at_once(opened, monkeypatch):
@@ -325,7 +325,7 @@ def test_a_damaged_best_leaves_the_second_best(opened, told):
         for step, score in ((1, 5.0), (2, 9.0), (3, 2.0)):
             fill(checkpoints, step, score=score)
     damage_last_byte(checkpoints.directory / "2" / "state" / "_METADATA")
-    assert opened(keep=None).restore_part(small(0), best=True).env_steps == 1
+    assert opened(keep=None).restore(small(0), best=True, part=True).env_steps == 1
     assert "using 1 instead" in told[0]
 
 
