@@ -23,7 +23,7 @@ import yaml
 from foajax.config.parse import ConfigError, flatten, one_line, refuse, replace, to_mapping
 from foajax.config.schema import Config, from_mapping
 from foajax.runs import durable
-from foajax.runs.lock import RunError, reason_of, take_lock
+from foajax.runs.lock import RunError, reason_of, refuse_run, take_lock
 from foajax.runs.provenance import RECORD, record_start
 
 PARAMETERS = "agent.safetensors"  # of a shipped agent, which is no run
@@ -87,14 +87,12 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
     try:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise refuse("run", path, "a directory", why="is a file", kind=RunError) from None
+        raise refuse_run(path, "is a file", "a directory") from None
     except (OSError, ValueError) as error:
-        raise refuse(
-            "run", path, "", why=f"cannot be created ({reason_of(error)}); choose another run=<dir>", kind=RunError
-        ) from None
+        raise refuse_run(path, f"cannot be created ({reason_of(error)}); choose another run=<dir>") from None
     if os.path.lexists(path / PARAMETERS):
         accepted = f"another run=<dir>, with train.init_from={path} to begin from its parameters"
-        raise refuse("run", path, accepted, why="is a shipped agent", kind=RunError)
+        raise refuse_run(path, "is a shipped agent", accepted)
     run_dir = RunDir(path, take_lock(path))
     try:
         _settle_config(path, config)
@@ -102,9 +100,7 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
         (path / _FAILURE).unlink(missing_ok=True)
     except OSError as error:
         run_dir.close()
-        raise refuse(
-            "run", path, "", why=f"cannot be used ({reason_of(error)}); choose another run=<dir>", kind=RunError
-        ) from None
+        raise refuse_run(path, f"cannot be used ({reason_of(error)}); choose another run=<dir>") from None
     except BaseException:
         run_dir.close()
         raise

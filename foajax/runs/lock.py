@@ -15,6 +15,11 @@ class RunError(ConfigError):
     """A run directory that cannot be used; the message is one line for the user."""
 
 
+def refuse_run(path: Path, why: str, accepted: str = "") -> ConfigError:
+    """The error, to be raised, about a run's directory."""
+    return refuse("run", path, accepted, why=why, kind=RunError)
+
+
 def is_held(path: Path) -> bool:
     """Whether a process has the run in `path` open, on this machine or on another that shares its files."""
     try:
@@ -32,9 +37,7 @@ def take_lock(path: Path) -> int:
     try:
         lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
-        raise refuse(
-            "run", path, "", why=f"cannot be written ({reason_of(error)}); choose another run=<dir>", kind=RunError
-        ) from None
+        raise refuse_run(path, f"cannot be written ({reason_of(error)}); choose another run=<dir>") from None
     try:
         _lock(lock)
         os.ftruncate(lock, 0)
@@ -42,14 +45,10 @@ def take_lock(path: Path) -> int:
     except BlockingIOError:
         holder = os.read(lock, 200).decode(errors="replace").strip() or "another process"
         os.close(lock)
-        raise refuse(
-            "run", path, "", why=f"in use by {holder}; end it or choose another run=<dir>", kind=RunError
-        ) from None
+        raise refuse_run(path, f"in use by {holder}; end it or choose another run=<dir>") from None
     except OSError as error:
         os.close(lock)
-        raise refuse(
-            "run", path, "", why=f"cannot be locked ({reason_of(error)}); choose another run=<dir>", kind=RunError
-        ) from None
+        raise refuse_run(path, f"cannot be locked ({reason_of(error)}); choose another run=<dir>") from None
     return lock
 
 
