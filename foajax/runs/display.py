@@ -14,11 +14,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from foajax.runs.rows import SPEED_ROWS, speed_of
+
 Record = Mapping[str, int | float | None]
 
 _IN_A_LINE = {"score": "score", "best_score": "best"}  # the rest is in metrics.jsonl
 _COLUMNS = 3  # of values, side by side
-_SPEED_ROWS = 10  # rows that the shown speed is averaged over
 
 
 class Display:
@@ -32,7 +33,7 @@ class Display:
 
     def __init__(self, *, total_env_steps: int, start: tuple[int, float], live: bool | None) -> None:
         self._total = total_env_steps
-        self._past = deque([start], maxlen=_SPEED_ROWS + 1)
+        self._past = deque([{"env_steps": start[0], "time": start[1]}], maxlen=SPEED_ROWS + 1)
         console = Console(force_terminal=live, highlight=False)
         wanted = sys.stdout.isatty() and not console.is_dumb_terminal if live is None else live
         self._live = Live(console=console, auto_refresh=False) if wanted else None
@@ -68,12 +69,10 @@ class Display:
 
     def _progress(self, record: Record) -> str:
         env_steps, seconds = int(record["env_steps"] or 0), float(record["time"] or 0)
-        self._past.append((env_steps, seconds))
-        first_steps, first_seconds = self._past[0]
-        speed = (env_steps - first_steps) / max(seconds - first_seconds, 1e-3)
+        self._past.append({"env_steps": env_steps, "time": seconds})
+        speed = speed_of(list(self._past)) or 0.0
         share = 100 * env_steps / self._total
-        words = [f"env_steps {env_steps:,} of {self._total:,} ({share:.1f}%)"]
-        words.append(f"{speed:,.0f} steps/s")
+        words = [f"env_steps {env_steps:,} of {self._total:,} ({share:.1f}%)", f"{speed:,.0f} steps/s"]
         if speed > 0:
             left = datetime.timedelta(seconds=round(max(self._total - env_steps, 0) / speed))
             words.append(f"{left} left")

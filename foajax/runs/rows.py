@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 _TAIL = 2**16  # bytes of metrics.jsonl read: some hundred rows
-_SPEED_ROWS = 10  # rows that the shown speed is averaged over
+SPEED_ROWS = 10  # rows that the shown speed is averaged over
 
 
 def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
@@ -34,7 +34,6 @@ def last_rows(path: Path) -> list[dict[str, Any]]:
 
 def speed_of(rows: list[dict[str, Any]]) -> float | None:
     """Env_steps a second over the newest rows; None where they do not tell."""
-    first, last = (rows[-_SPEED_ROWS - 1 :][0], rows[-1]) if len(rows) > 1 else (None, None)
-    if first is None or last is None or last["time"] <= first["time"]:
-        return None
-    return (last["env_steps"] - first["env_steps"]) / (last["time"] - first["time"])
+    rows = rows[-SPEED_ROWS - 1 :]
+    seconds = rows[-1]["time"] - rows[0]["time"] if rows else 0.0
+    return (rows[-1]["env_steps"] - rows[0]["env_steps"]) / seconds if seconds > 0 else None
