@@ -26,11 +26,8 @@ from foajax.config.schema import (
 from foajax.config.shipped import experiments
 from foajax.config.table import Key, defaults, groups
 
-_KINDS: dict[str, type[Section]] = {
-    "rings": RingSensor,
-    "logpolar": LogPolarSensor,
-    "own": OwnSensor,
-}  # sensors of one's own, by themselves
+# Sensors of one's own, by themselves.
+_KINDS: dict[str, type[Section]] = {"rings": RingSensor, "logpolar": LogPolarSensor, "own": OwnSensor}
 _PLANS = "plans"  # of experiments/; `foajax.reproduce` reads them, they are no group
 _WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave out
 

@@ -18,18 +18,7 @@ from foajax.runs import durable
 from foajax.runs.lock import RunError
 
 RECORD = "run.json"
-_PACKAGES = (
-    "foajax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "numpy",
-    "envpool",
-    "ale-py",
-    "gymnasium",
-)
+_PACKAGES = ("foajax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "envpool", "ale-py", "gymnasium")
 
 
 def record_start(path: Path, command: Sequence[str], devices: Sequence[str]) -> None:

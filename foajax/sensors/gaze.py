@@ -26,9 +26,7 @@ from foajax.config.schema import GazeConfig
 from foajax.sensors.geometry import Shape
 
 # (y, x) of stay, up, down, left, right; with nine actions, the diagonals too.
-_STRAIGHT = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)]
-_DIAGONAL = [(-1, -1), (-1, 1), (1, -1), (1, 1)]
-DIRECTIONS = np.array(_STRAIGHT + _DIAGONAL, np.int32)
+DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)], np.int32)
 NAMES = ("stay", "up", "down", "left", "right", "up left", "up right", "down left", "down right")
 
 
