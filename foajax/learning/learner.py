@@ -77,7 +77,8 @@ def loss(
         heads["vision"] = per_environment(vision)(*transitions, output.vision_value)
     masks = [(targets.policy_mask_t, targets.value_mask_t) for targets in heads.values()]
     valid = _whole(jnp.stack([jnp.stack([losses.valid_steps(mask) for mask in pair]) for pair in masks]), axis)
-    totals, metrics = {}, {}
+    totals: dict[str, Array] = {}
+    metrics: Metrics = {}
     for i, (name, targets) in enumerate(heads.items()):
         totals[name], found = _head_loss(
             config,
