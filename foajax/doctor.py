@@ -20,7 +20,7 @@ from rich.table import Table
 
 from foajax import cli
 from foajax.config.parse import Section, one_line
-from foajax.runs.provenance import version
+from foajax.runs.provenance import machine, version
 
 EXTRAS = {
     "cuda": "trains on an NVIDIA GPU",
@@ -45,7 +45,7 @@ def doctor(arguments: Sequence[str]) -> int:
         "packages": ", ".join(f"{name} {version(name)}" for name in ("jax", "flax", "envpool", "ale-py", "gymnasium")),
         "missing": ", ".join(missing) or "nothing",
         "devices": _devices(),
-        "cores": f"{len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()}",
+        "cores": f"{machine()['cores']}",
         "memory": _memory(),
         "disk": f"{shutil.disk_usage('.').free / 1e9:.0f} GB free here",
     }

@@ -186,7 +186,9 @@ class Agent:
             mean, std = jax.vmap(lambda f: frames.pixel_statistics(f, statistics))(frame)
         else:
             mean, std = jax.vmap(frames.frame_statistics)(frame)
-        return self.sense(self.normalise(frame, statistics), focal_point), mean, std
+        mode = self.config.network.normalization
+        normalised = jax.vmap(lambda f: frames.normalise(f, statistics, mode=mode))(frame)
+        return self.sense(normalised, focal_point), mean, std
 
     def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W *C"]:
         """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
@@ -199,11 +201,6 @@ class Agent:
         if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
             accepted = f"uint8 [B, {', '.join(map(str, shape))}], {'RGB' if self.config.env.color else 'gray'}"
             raise refuse("frame", f"{screen.dtype} {list(screen.shape)}", accepted)
-
-    def normalise(self, frame: Float[Array, "B H W *C"], statistics: FrameStatistics) -> Float[Array, "B H W *C"]:
-        """Frames with about zero mean and unit deviation, by the configured rule."""
-        mode = self.config.network.normalization
-        return jax.vmap(lambda f: frames.normalise(f, statistics, mode=mode))(frame)
 
     def look(self, key: Key[Array, "B"], state: ActorState, timestep: TimeStep) -> tuple[Array, Array]:
         """Focal points to sense this step at, and the actors' ages: both begin anew with an episode."""
