@@ -93,11 +93,7 @@ class Eye:
         self._seeing = Seeing.of(sensor, self._pixels.frame_shape)
         _check(self._gaze, self._seeing.sensor, self._pixels.frame_shape)
         window = gazes.bounded(self._gaze, self._seeing.sensor)
-        self._where: dict[str, Any] = {
-            "gaze": self._gaze,
-            "window": window,
-            "frame_shape": self._pixels.frame_shape,
-        }
+        self._where: dict[str, Any] = {"gaze": self._gaze, "window": window, "frame_shape": self._pixels.frame_shape}
         self.observation_space = self._observation_space(observation_space)
         self.action_space = joint_space(actions, action_space, self._gaze.num_actions)
         self.num_vision = self._gaze.num_actions

@@ -22,15 +22,9 @@ CROPPED = 160  # rows kept of an Atari screen
 
 
 def to_frame(screen: UInt8[Array, "h w *C"], crop_top: int | None) -> Float[Array, "H W *C"]:
-    """The frame that a sensor looks at.
+    """The frame that a sensor looks at, in [0, 1], of a screen in 0..255, gray or in colour.
 
-    Args:
-      screen: gray or in colour, 0..255.
-      crop_top: first screen row kept of a 210x160 Atari screen (`crop_and_halve`), or None where
-        the screen has the frame's size already.
-
-    Returns:
-      The frame, in [0, 1]: 80x80 where cropped, else h x w.
+    With `crop_top` the screen is Atari's and the frame 80x80 (`crop_and_halve`); with None they have the same size.
     """
     if crop_top is None:
         return screen.astype(jnp.float32) * jnp.float32(1 / 255)
@@ -38,19 +32,12 @@ def to_frame(screen: UInt8[Array, "h w *C"], crop_top: int | None) -> Float[Arra
 
 
 def crop_and_halve(screen: UInt8[Array, "210 160 *C"], crop_top: int) -> Float[Array, "80 80 *C"]:
-    """Mean of each 2x2 block of the screen rows crop_top .. crop_top + 159.
+    """Mean of each 2x2 block of the rows crop_top .. crop_top + 159 of a screen in 0..255, as a frame in [0, 1].
 
     The sum of four pixels is exact: `round(1020 * frame)` gives it back.
 
-    Args:
-      screen: gray or in colour, 0..255.
-      crop_top: first row kept, 0..50.
-
-    Returns:
-      The frame, in [0, 1].
-
     Raises:
-      ValueError: if the crop leaves the screen.
+      ConfigError: the crop leaves the screen; `crop_top` is from 0 to 50.
     """
     if not 0 <= crop_top <= screen.shape[0] - CROPPED:
         raise refuse("crop_top", crop_top, f"a row from 0 to {screen.shape[0] - CROPPED}")
@@ -100,9 +87,6 @@ def update_statistics(
       statistics: what has been seen so far.
       frame_mean, frame_std: averages of what `frame_statistics` or `pixel_statistics` give for the frames.
       count: how many frames; with 0 nothing changes.
-
-    Returns:
-      The new statistics.
     """
     log_decay = count * math.log(PIXEL_DECAY if statistics.mean.ndim else DECAY)
     # expm1, because 1 - DECAY^n loses half of float32's digits for small n.
@@ -120,7 +104,7 @@ def normalise(
     *,
     mode: Literal["running", "pixel", "frame", "none"],
 ) -> Float[Array, "H W *C"]:
-    """(frame - mean) / max(std, SMALLEST_STD).
+    """(frame - mean) / max(std, SMALLEST_STD), without bounds unless `none`.
 
     Args:
       frame: in [0, 1].
@@ -129,9 +113,6 @@ def normalise(
         the frame's own while nothing has been seen; with `pixel`, each pixel has a mean of its own,
         so that what never changes is 0. `frame`: the frame's own; `none`: the frame is returned as
         it is.
-
-    Returns:
-      The normalised frame, without bounds unless `none`.
     """
     if mode == "none":
         return frame
