@@ -18,22 +18,17 @@ class FactsTracker:
     """The facts of the last episodes to end."""
 
     def __init__(self, *, window: int = 2000) -> None:
-        self._window = window
-        self._rows: deque[Facts] = deque()
-        self._count = 0
+        self._episodes: deque[Facts] = deque(maxlen=window)
 
     def add(self, facts: Mapping[str, np.ndarray], is_over: Bool[np.ndarray, "B"]) -> None:
         """Takes in the facts, each [B, ...], of those of B episodes that are over."""
-        if not is_over.any():
-            return
-        self._rows.append({name: np.asarray(values)[is_over] for name, values in facts.items()})
-        self._count += int(is_over.sum())
-        while self._count - len(next(iter(self._rows[0].values()))) >= self._window:
-            self._count -= len(next(iter(self._rows.popleft().values())))
+        for i in np.flatnonzero(is_over):
+            self._episodes.append({name: np.array(values[i]) for name, values in facts.items()})
 
     def table(self) -> Facts:
         """All of them, in the order in which the episodes ended; empty where none has."""
-        return pooled(self._rows)
+        names = self._episodes[0] if self._episodes else ()
+        return {name: np.array([facts[name] for facts in self._episodes]) for name in names}
 
 
 def pooled(tables: Iterable[Facts]) -> Facts:
