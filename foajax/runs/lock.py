@@ -8,7 +8,7 @@ import socket
 import time
 from pathlib import Path
 
-from foajax.config.parse import ConfigError, one_line, refuse
+from foajax.config.parse import ConfigError, brief, refuse
 
 
 class RunError(ConfigError):
@@ -66,5 +66,4 @@ def _lock(descriptor: int) -> None:
 
 def reason_of(error: Exception) -> str:
     """Why a file cannot be used, for the end of a line."""
-    text = getattr(error, "strerror", None) or one_line(error)
-    return text if len(text) <= 200 else text[:197] + "..."
+    return brief(getattr(error, "strerror", None) or error)

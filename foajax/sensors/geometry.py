@@ -111,7 +111,7 @@ def ring_edges(sensor: LogPolarSensor) -> np.ndarray:
 
 
 def shares(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(cell, pixel of the window, weight) of all that `warp` adds up, sorted by cell; cells and pixels are numbered."""
+    """(cell, pixel of the window, weight) of all that is added up, sorted by cell; cells and pixels are numbered."""
     return _bilinear_weights(sensor) if sensor.sampling == "bilinear" else _area_weights(sensor)
 
 

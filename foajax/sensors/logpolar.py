@@ -39,7 +39,7 @@ class LogPolar(Sensor):
 
     def sense(self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str) -> tuple[Array, ...]:
         """The cells around the focal point."""
-        return look(frame, focal_point, bounds, size=self.window, pool=self._pool)
+        return look(frame, focal_point, bounds, size=self.window, pool=self._warp)
 
     def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
         """Rings and wedges, whatever the frame."""
@@ -52,20 +52,16 @@ class LogPolar(Sensor):
         window = unwarp(images[0], sensor=self.config)
         return place(window, focal_point - np.array(self.window) // 2, frame_shape)
 
-    def _pool(self, window: Num[Array, "h w"]) -> tuple[Float[Array, "_ _"], ...]:
-        return (warp(window.astype(jnp.float32), sensor=self.config),)
+    def _warp(self, window: Num[Array, "side side"]) -> tuple[Float[Array, "rings wedges"]]:
+        """A window of the frame, seen by the retina; inner rings first, values not rescaled.
 
-
-def warp(window: Float[Array, "side side"], *, sensor: LogPolarSensor) -> Float[Array, "rings wedges"]:
-    """A window of the frame, seen by the retina; inner rings first, values not rescaled.
-
-    'bilinear' samples each cell's centre, between four pixels: sharp, but a cell larger than a few
-    pixels misses what lies between the centres. 'area' takes the mean over each cell's area, which
-    does not alias; cells smaller than a pixel show the pixels under them.
-    """
-    pixels = window.reshape(-1)
-    cells = [(pixels[index] * weight).sum(1) for index, weight in _tables(sensor)]
-    return jnp.concatenate(cells).reshape(sensor.rings, sensor.wedges)
+        'bilinear' samples each cell's centre, between four pixels: sharp, but a cell larger than a few
+        pixels misses what lies between the centres. 'area' takes the mean over each cell's area, which
+        does not alias; cells smaller than a pixel show the pixels under them.
+        """
+        pixels = window.astype(jnp.float32).reshape(-1)
+        cells = [(pixels[index] * weight).sum(1) for index, weight in _tables(self.config)]
+        return (jnp.concatenate(cells).reshape(self.config.rings, self.config.wedges),)
 
 
 def unwarp(image: Float[Array, "rings wedges"], *, sensor: LogPolarSensor) -> Float[Array, "side side"]:
