@@ -58,8 +58,9 @@ class Agent:
     @property
     def network(self) -> networks.Network:
         """The network, without its parameters."""
-        gaze = self.config.gaze
-        return networks.Network(self.config.network, self.num_actions, gaze.num_actions if gaze.learned else 0)
+        config = self.config
+        num_vision_actions = config.gaze.num_actions if config.gaze.learned else 0
+        return networks.Network(config.network, self.num_actions, num_vision_actions)
 
     @property
     def image_shapes(self) -> tuple[tuple[int, int, int], ...]:

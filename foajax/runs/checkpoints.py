@@ -147,8 +147,7 @@ class Checkpoints:
         reported through `warn` and the one before it is tried. Arrays arrive where the template has them.
 
         Args:
-          template: what is asked for.
-          part: whether it may leave out arrays that the checkpoint has.
+          part: whether `template` may leave out arrays that the checkpoint has.
           best: take the highest ``meta["score"]`` first (among equals, and without one, the newest).
 
         Raises:
