@@ -48,7 +48,7 @@ def test_a_request_to_stop_is_heard_at_any_moment(tmp_path):
         started = "resumed at" in out or "new run" in out
         assert process.returncode == 0 or not started, err
         if process.returncode == 0:
-            ended = f"saved at {newest(run):,} env_steps" if newest(run) else "before anything was learned"
+            ended = f"saved at {newest(run):,} env_steps" if newest(run) else "stopped before anything was learned"
             assert f"{sent.name}: {ended}" in out and newest(run) >= before
         codes.append(process.returncode)
     assert codes.count(0) >= 8 and load_agent(run).env_steps == newest(run)
