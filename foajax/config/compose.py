@@ -6,7 +6,7 @@ Hydra and OmegaConf take a third of a second to import, so that is left to the f
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,7 +24,7 @@ from foajax.config.schema import (
     renamed,
 )
 from foajax.config.shipped import experiments
-from foajax.config.table import Key, defaults, groups
+from foajax.config.table import defaults, groups
 
 # Sensors of one's own, by themselves.
 _KINDS: dict[str, type[Section]] = {"rings": RingSensor, "logpolar": LogPolarSensor, "own": OwnSensor}
@@ -131,7 +131,8 @@ def from_node(node: Any, words: Collection[str] = ()) -> Config:
         node = OmegaConf.create(plain)
         return from_mapping(OmegaConf.to_container(node, resolve=True, throw_on_missing=True))
     except MissingMandatoryValue as error:
-        sentence = next((key.sentence for key in _keys() if key.name == error.full_key and key.default is ABSENT), "")
+        required = (key for group in groups(Config) for key in group.keys if key.default is ABSENT)
+        sentence = next((key.sentence for key in required if key.name == error.full_key), "")
         accepted = with_sentence(f"{error.full_key}=value", sentence)
         raise refuse(str(error.full_key), accepted=accepted, why="missing") from None
     except OmegaConfBaseException as error:
@@ -145,11 +146,6 @@ def _check_kind(sensor: Any, stated: Collection[str]) -> None:
     cls = _KINDS.get(str(kind))
     if cls is not None and "sensor.kind" in stated and sensor.keys() - cls.model_fields.keys():
         raise refuse("sensor.kind", kind, f"sensor={kind}, which brings the keys of that kind")
-
-
-def _keys() -> Iterator[Key]:
-    """All keys, in their order."""
-    return (key for group in groups(Config) for key in group.keys)
 
 
 def _first_line(error: Exception) -> str:

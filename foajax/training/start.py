@@ -40,10 +40,9 @@ def check(config: Config) -> None:
     find_logger(config)
     make_torso(config.network)
     make_core(config.network)
-    if config.train.init_from is not None and not newest_checkpoint(
-        Path(config.run_dir)
-    ):  # one that goes on does not need it
-        check_source(config.train.init_from)
+    source = config.train.init_from
+    if source is not None and not newest_checkpoint(Path(config.run_dir)):  # a run that goes on does not need it
+        check_source(source)
 
 
 def start(config: Config) -> None:
