@@ -85,8 +85,9 @@ def gaze(frame_shape: tuple[int, int]) -> Task:
 
     Its kind (`seek.draw_object`) is lost in any mean over an even block. With the patch in view from
     the start the optimal return is 16, the value at time t the sum of gamma^k over k < 16 - t. A gaze
-    that needs n moves to bring it into view can earn 16 - n on average, one that never does 0. In an
-    80x80 frame it covers rows 36-43 and columns 10-17.
+    that needs n moves to bring it into view can earn 16 - n on average, one that never does 0. A core that is
+    told the last reward needs no look: a guess tells it the cue (`network.last_reward=false`). In an 80x80
+    frame the patch covers rows 36-43 and columns 10-17.
     """
 
     def draw(shape: tuple[int, int], state: ProbeState) -> UInt8[Array, "H W"]:

@@ -254,11 +254,3 @@ def test_the_value_of_a_probe_is_learned(probe, value):
 def test_the_core_learns_to_remember():
     loop = Loop("game=probe:memory", *PROBE, "learner.natural.gamma=0.9")
     assert loop.run(400) > 0.8 / 5  # the best is a reward in four steps and a reset; 0 without memory
-
-
-@pytest.mark.slow
-def test_the_gaze_learns_to_move_where_the_cue_is():
-    words = ["gaze=learned", "sensor.rings=[[16,16,1]]", "learner.natural.gamma=0.9", "learner.rollout_length=17"]
-    loop = Loop("game=probe:gaze", *PROBE, *words)
-    # Four moves bring the cue into view, 12 of 17 steps are left to be right in; a gaze that stays earns 0.
-    assert loop.run(500) > 0.75 * 12 / 17
