@@ -3,9 +3,9 @@
     pip install foajax stable-baselines3
     python stable_baselines3_ppo.py ALE/Pong-v5 --steps 1000000
 
-PPO takes both actions as one `MultiDiscrete`, [natural, visual]. Images are uint8, which `MultiInputPolicy` takes for
-images: it divides them by 255, and its own network wants 36x36 pixels at least. A packed focal area is smaller, so the
-features here have smaller filters.
+PPO takes both actions as one `MultiDiscrete`, [natural, visual]. `VecNormalize` scales each value of an image by its
+own mean and deviation, or a small ball would hardly show. `MultiInputPolicy` would flatten such images, and its network
+for images wants 36x36 pixels at least, so the features here are their own.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import argparse
 
 import ale_py
 import gymnasium
-import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.atari_wrappers import AtariWrapper
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 import foajax
@@ -30,11 +30,11 @@ gymnasium.register_envs(ale_py)
 def see(env: gymnasium.Env, sensor: str) -> gymnasium.Env:
     """The last four frames of an Atari game, through a sensor. Lives are episodes and rewards are signs."""
     env = gymnasium.wrappers.FrameStackObservation(AtariWrapper(env), 4)  # PPO has no memory
-    return foajax.FoveatedObservation(env, sensor, dtype=np.uint8, actions="multidiscrete")
+    return foajax.FoveatedObservation(env, sensor, actions="multidiscrete")
 
 
 class Features(BaseFeaturesExtractor):
-    """Two small convolutions for each image, and a dense layer that has the focal point too."""
+    """Two small convolutions for each image, [h, w, c], and a dense layer that has the focal point too."""
 
     def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
         super().__init__(observation_space, features_dim=256)
@@ -43,14 +43,15 @@ class Features(BaseFeaturesExtractor):
         for name, space in observation_space.items():
             if name == "focal_point":
                 continue
-            layers = [nn.Conv2d(space.shape[0], 32, 4, 2), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.Flatten()]
-            self.images[name] = nn.Sequential(*layers)
+            height_width, channels = space.shape[:2], space.shape[2]
+            layers = [nn.Conv2d(channels, 32, 4, 2), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU()]
+            self.images[name] = nn.Sequential(*(layers if min(height_width) >= 10 else []), nn.Flatten())
             with torch.no_grad():
-                width += self.images[name](torch.zeros(1, *space.shape)).shape[1]
+                width += self.images[name](torch.zeros(1, channels, *height_width)).shape[1]
         self.dense = nn.Sequential(nn.Linear(width, self.features_dim), nn.ReLU())
 
     def forward(self, observation: dict[str, torch.Tensor]) -> torch.Tensor:
-        parts = [network(observation[name]) for name, network in self.images.items()]
+        parts = [network(observation[name].permute(0, 3, 1, 2)) for name, network in self.images.items()]
         return self.dense(torch.cat([*parts, observation["focal_point"]], dim=1))
 
 
@@ -59,6 +60,8 @@ def train(game: str, sensor: str, steps: int, num_envs: int, seed: int = 0) -> P
     emulator = {"frameskip": 1, "repeat_action_probability": 0.0}
     kwargs = {"env_kwargs": emulator, "wrapper_class": see, "wrapper_kwargs": {"sensor": sensor}}
     envs = make_vec_env(game, num_envs, seed=seed, **kwargs)  # scores are of whole games, from before the wrapper
+    images = [name for name in envs.observation_space if name != "focal_point"]
+    envs = VecNormalize(envs, norm_reward=False, norm_obs_keys=images)
     model = PPO(
         "MultiInputPolicy",
         envs,
@@ -82,4 +85,6 @@ if __name__ == "__main__":
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--num-envs", type=int, default=8)
     options = parser.parse_args()
-    train(options.game, options.sensor, options.steps, options.num_envs).save("foajax_ppo")
+    model = train(options.game, options.sensor, options.steps, options.num_envs)
+    model.save("foajax_ppo")
+    model.get_vec_normalize_env().save("foajax_ppo.pkl")  # means and deviations, which playing needs too
