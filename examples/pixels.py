@@ -1,21 +1,16 @@
-r"""Environments of other libraries as pixels with discrete actions, for foajax's own learner.
+"""Environments of other libraries as pixels with discrete actions, for foajax's own learner.
 
-    cd examples
-    foajax train game=gymnasium:pixels:MiniGrid env.kwargs.task=MiniGrid-Empty-8x8-v0 experiment=constant50_sub2_packed
-    MUJOCO_GL=egl foajax train game=gymnasium:pixels:Camera env.kwargs.task=InvertedPendulum-v5
-
-Gymnasium's CarRacing needs none of it. Each of its steps costs 0.1 and a piece of track earns about 3, which the signs
-of rewards would hide:
-
-    foajax train game=gymnasium:CarRacing-v3 env.kwargs.continuous=false env.clip_rewards=false \
-        experiment=constant70_packed
+cd examples
+foajax train game=gymnasium:pixels:MiniGrid env.kwargs.task=MiniGrid-Empty-8x8-v0 experiment=constant50_sub2_packed
+MUJOCO_GL=egl foajax train game=gymnasium:pixels:Camera env.kwargs.task=InvertedPendulum-v5
+foajax train game=gymnasium:pixels:Driving env.clip_rewards=false experiment=constant70_packed
 """
 
 from __future__ import annotations
 
 import gymnasium
 import numpy as np
-from gymnasium.wrappers import AddRenderObservation, TransformAction
+from gymnasium.wrappers import AddRenderObservation, MaxAndSkipObservation, TransformAction
 
 
 def minigrid(task: str = "MiniGrid-Empty-8x8-v0", tile_size: int = 10, **kwargs) -> gymnasium.Env:
@@ -43,5 +38,14 @@ def camera(task: str = "InvertedPendulum-v5", size: int = 84, levels: int = 3, *
     return TransformAction(env, drive, gymnasium.spaces.Discrete(len(low) * levels))
 
 
+def driving(skip: int = 4, **kwargs) -> gymnasium.Env:
+    """CarRacing with its five actions, each held for `skip` frames; `pip install "gymnasium[box2d]"`.
+
+    Each frame costs 0.1 and a piece of track earns about 3: the signs of rewards would hide what driving is worth.
+    """
+    return MaxAndSkipObservation(gymnasium.make("CarRacing-v3", continuous=False, **kwargs), skip)
+
+
 gymnasium.register("MiniGrid", minigrid)
 gymnasium.register("Camera", camera)
+gymnasium.register("Driving", driving)

@@ -96,7 +96,7 @@ def test_a_mujoco_task_is_seen_by_its_camera(monkeypatch):
 @pytest.mark.parametrize(
     ("needs", "words", "num_actions"),
     [
-        ("Box2D", ["game=gymnasium:CarRacing-v3", "env.kwargs.continuous=false"], 5),
+        ("Box2D", ["game=gymnasium:pixels:Driving"], 5),
         ("minigrid", ["game=gymnasium:pixels:MiniGrid", "env.kwargs.task=MiniGrid-Empty-5x5-v0"], 7),
         ("imageio", ["game=gymnasium:pixels:Camera", "env.kwargs.task=InvertedPendulum-v5"], 3),
     ],
