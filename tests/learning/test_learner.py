@@ -11,7 +11,7 @@ from foajax.config import compose
 from foajax.envs.make import make_environments
 from foajax.learning import learner, losses
 from foajax.learning.agent import Agent
-from foajax.learning.programs import total_updates
+from foajax.learning.programs import acting_keys, total_updates
 from foajax.sensors.frames import PIXEL_DECAY
 from foajax.training.collector import Collector, update_on
 
@@ -51,6 +51,50 @@ def test_the_loss_is_the_sum_of_its_weighted_terms(seek):
         for head, weight in (("natural", 1.0), ("vision", config.vision_weight))
     )
     np.testing.assert_allclose(total, expected, rtol=1e-5)
+
+
+APART = ["clip_ratio=0.2", "value_weight=0.7", "vision_weight=0.3", "credits_last_gaze=false"]
+APART += ["natural.gamma=0.9", "natural.gae_lambda=0", "natural.entropy_weight=0.01"]
+APART += ["vision.gamma=0.5", "vision.gae_lambda=0", "vision.entropy_weight=0.03"]
+
+
+def test_the_loss_is_that_of_each_step_where_episodes_end(seek):
+    """Lambda is 0: an advantage is a reward, the next value and the own one. The vision head's reward comes later."""
+    (rollout,), _ = seek.collect()
+    random, is_first, is_terminal = np.random.default_rng(0), *np.zeros((2, 7, 8), bool)
+    is_terminal[[3, 0, 6, 5], [3, 1, 6, 7]] = True
+    is_first[[4, 1, 3, 6], [3, 1, 5, 7]] = True  # environment 5 is cut; 6 ends with the rollout
+    reward, natural, vision = (random.normal(size=(7, 8)).astype(np.float32) for _ in range(3))
+    behaviour = {"natural": natural - 1, "vision": vision - 2}
+    new = {"reward": reward, "is_first": is_first, "is_terminal": is_terminal}
+    new |= {f"{head}_log_prob": value for head, value in behaviour.items()}
+    steps = rollout.steps._replace(**jax.tree.map(jnp.asarray, new))
+    rollout = rollout._replace(steps=steps)
+    words = [f"learner.{word}" for word in APART]
+    config = compose.compose([*SMALL, "game=seek", "experiment=constant50_sub2_packed", *words])
+    agent = Agent(config, seek.agent.num_actions, seek.agent.crop_top)
+    total, _ = jax.jit(lambda params: learner.loss(params, agent, rollout))(seek.state.params)
+
+    output, expected = seek.unroll(seek.state.params, rollout), 0.0
+    for head, weight in (("natural", 1.0), ("vision", 0.3)):
+        own, value = getattr(config.learner, head), np.asarray(getattr(output, f"{head}_value"))
+        advantage, learns, acts = np.zeros((6, 8)), np.zeros((6, 8), bool), np.zeros((6, 8), bool)
+        for t, b in np.ndindex(6, 8):
+            ends, later = is_terminal[t + 1, b], head == "vision"
+            known = t < 5 and (ends or not is_first[t + 2, b])
+            if is_first[t + 1, b] or (later and not known):
+                continue
+            earned = (0.0 if ends else reward[t + 2, b]) if later else reward[t + 1, b]
+            advantage[t, b] = earned + own.gamma * (not ends) * value[t + 1, b] - value[t, b]
+            learns[t, b], acts[t, b] = True, not (later and ends)
+        log_p = np.asarray(jax.nn.log_softmax(getattr(output, f"{head}_logits")))[:-1]
+        chosen = np.take_along_axis(log_p, np.asarray(getattr(steps, f"{head}_action"))[:-1, :, None], -1)[..., 0]
+        ratio = np.exp(chosen - behaviour[head][:-1])
+        scaled = (advantage - advantage[acts].mean()) / advantage[acts].std()
+        gained = np.minimum(ratio * scaled, np.clip(ratio, 0.8, 1.2) * scaled)
+        gained -= own.entropy_weight * (np.exp(log_p) * log_p).sum(-1)
+        expected += weight * (0.7 * 0.5 * np.square(advantage[learns]).mean() - gained[acts].mean())
+    np.testing.assert_allclose(total, expected, rtol=1e-4)
 
 
 def test_values_learn_from_lambda_returns(seek):
@@ -172,6 +216,21 @@ def test_by_pixel_the_statistics_hold_the_mean_frame():
     np.testing.assert_allclose(weight, 1 - PIXEL_DECAY**48, rtol=1e-5)
 
 
+def test_who_observes_knows_frames_and_learns_nothing():
+    """The deviation is that of the last rollout: while the first was seen, the mean was not known."""
+    loop, seen = Loop("game=seek", *VIEW, "network.normalization=pixel"), []
+    params = jax.tree.map(np.array, loop.state.params)
+    for _ in range(2):
+        (rollout,), _ = loop.collect()
+        seen.append([np.array(x[:-1]) for x in rollout.steps.frames])
+        loop.state = loop.programs.observe(loop.state, rollout)
+    mean, std, weight = loop.state.statistics
+    np.testing.assert_allclose(weight, 1 - PIXEL_DECAY**96, rtol=1e-5)
+    np.testing.assert_allclose(mean / weight, np.concatenate([seen[0][0], seen[1][0]]).mean((0, 1)), atol=1e-3)
+    np.testing.assert_allclose(std / weight, seen[1][1].mean(), rtol=1e-5)
+    chex.assert_trees_all_equal(loop.state.params, params)
+
+
 def test_information_is_what_decisions_tell_of_what_was_seen(seek):
     """None where the policy is the same whatever is seen; all of it where every decision is certain."""
     (rollout,), _ = seek.collect()
@@ -228,6 +287,13 @@ def test_the_same_seed_gives_the_same_parameters_and_another_does_not():
     assert not all(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
 
 
+def test_each_actor_has_random_numbers_of_its_own_in_whichever_process_it_is():
+    keys = lambda *of: jax.random.key_data(acting_keys(*of))  # noqa: E731
+    np.testing.assert_array_equal(keys(0, 0, 4, 4), keys(0, 0, 0, 8)[4:])
+    every = np.concatenate([keys(seed, group, 0, 8) for seed, group in ((0, 0), (0, 1), (1, 0))])
+    assert len(np.unique(every, axis=0)) == 24
+
+
 def test_the_schedule_counts_the_updates_of_a_rollout_that_has_begun():
     config = compose.compose([*SMALL, "learner.num_epochs=3", "train.env_steps=49"])  # rollouts of 48
     assert total_updates(Agent(config, 4, 34)) == 2 * 2 * 3
@@ -252,5 +318,6 @@ def test_the_value_of_a_probe_is_learned(probe, value):
 
 @pytest.mark.slow
 def test_the_core_learns_to_remember():
-    loop = Loop("game=probe:memory", *PROBE, "learner.natural.gamma=0.9")
-    assert loop.run(400) > 0.8 / 5  # the best is a reward in four steps and a reset; 0 without memory
+    """The best is a reward in four steps and a reset. Without memory it is 0, unless the last action serves as one."""
+    loop = Loop("game=probe:memory", *PROBE, "learner.natural.gamma=0.9", "network.last_actions=false")
+    assert loop.run(400) > 0.8 / 5
