@@ -71,6 +71,7 @@ class Agent:
         self.core = {name: np.zeros((1, *shape), np.float32) for name, shape in states.items()}
         self.age = 0  # decisions since the episode began
         self.last_actions: tuple[int, int] | None = None  # change it where the robot did something else
+        self._due = 0.0  # price of the last saccade, taken from the next reward as in training
         start, low, high = self.facts["gaze"]["start"], *self._limits
         self.focal_point = self._random.integers(low, high + 1) if start == "random" else np.array(start)
         self.looked_at = self.focal_point  # the last focal point, where focal_point is the next: (y, x), frame pixels
@@ -91,9 +92,10 @@ class Agent:
             drawn = gaze["mode"] == "random"
             vision = int(self._random.integers(len(gaze["moves"]))) if drawn else self._choose(outputs["vision_logits"])
         self.core = {name: outputs[f"next_{name}"] for name in self.core}
+        moved = self.focal_point - self.looked_at
+        self._due = gaze["cost"] * (np.hypot(*moved) if gaze["cost_per"] == "pixel" else moved.any())
         self.outputs, self.looked_at, self.last_actions = outputs, self.focal_point, (natural, vision)
-        self.age += 1
-        self.focal_point = self._move(vision)
+        self.age, self.focal_point = self.age + 1, self._move(vision)
         return natural, vision
 
     def frame(self, image: np.ndarray, area: tuple = WHOLE) -> np.ndarray:
@@ -117,18 +119,18 @@ class Agent:
     def _side(self, reward: float) -> dict[str, np.ndarray]:
         """What the network is told beside the images."""
         told, parts = self.facts["side"], []
-        low, high = self._limits
         if told["focal_point"] == "frame":
             parts.append(self.focal_point / np.array(self.facts["frame_shape"]) * 2.0 - 1.0)
         elif told["focal_point"] == "reach":
-            parts.append((2 * self.focal_point - (low + high)) / np.maximum(high - low, 1))
+            parts.append((2 * self.focal_point - self._limits.sum(0)) / np.maximum(np.ptp(self._limits, 0), 1))
         for place, count in enumerate(told["last_actions"] or ()):
             last = -1 if self.last_actions is None else self.last_actions[place]
             parts.append(np.arange(count) == last)
         if not np.isfinite(reward):
             raise AgentError(f"reward={reward}: accepted is a finite number")
         if told["last_reward"]:
-            parts.append([0.0 if self.last_actions is None else np.sign(reward) if told["clip_reward"] else reward])
+            earned = np.sign(reward) if told["clip_reward"] else reward
+            parts.append([0.0 if self.last_actions is None else earned - self._due])
         return {"side": np.concatenate(parts).astype(np.float32)[None]} if parts else {}
 
     def _choose(self, logits: np.ndarray) -> int:
@@ -138,7 +140,7 @@ class Agent:
     def _move(self, vision: int) -> np.ndarray:
         gaze, path = self.facts["gaze"], self.facts["gaze"]["path"]
         to = self.focal_point * gaze["relative"] + gaze["moves"][vision]
-        return np.array(path[self.age % len(path)]) if gaze["mode"] == "scripted" else np.clip(to, *self._limits)
+        return np.array(path[(self.age + 1) % len(path)]) if gaze["mode"] == "scripted" else np.clip(to, *self._limits)
 
 
 class Sensor:
@@ -270,8 +272,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 @functools.cache
 def _spans(source: int, target: int, begin: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """The source pixel in which each target pixel begin .. end begins; those that begin inside one, and the part of it
-    before them."""
+    """The source pixel in which each target pixel begin .. end begins; which begin inside one, the part before them."""
     first, rest = np.divmod(np.arange(begin, end + 1) * source, target)
     shared = np.flatnonzero(rest)
     return first, shared, (rest[shared] / target).astype(np.float32)[:, None], target / source
@@ -288,8 +289,7 @@ def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.nd
 def _block_sums(x: np.ndarray, factor: int) -> np.ndarray:
     sums = x[::factor].copy()
     for i in range(1, factor):
-        part = x[i::factor]
-        sums[: len(part)] += part
+        sums[: len(x[i::factor])] += x[i::factor]
     return sums
 
 

@@ -101,6 +101,7 @@ def _decide(stored: TrainedAgent, given: Arrays) -> Arrays:
         focal_point=given["focal_point"],
         age=given["age"],
         last_actions=given.get("last_actions"),
+        owed=given.get("owed"),
     )
     never = jnp.zeros_like(given["is_first"])
     timestep = TimeStep(given["frame"], given["reward"], is_first=given["is_first"], is_terminal=never)
@@ -122,5 +123,5 @@ def _decide(stored: TrainedAgent, given: Arrays) -> Arrays:
 def _named(state: ActorState) -> Arrays:
     """The state as one mapping."""
     core = {f"core_{i}": leaf for i, leaf in enumerate(jax.tree.leaves(state.core_state))}
-    named = core | {"focal_point": state.focal_point, "age": state.age}
-    return named if state.last_actions is None else named | {"last_actions": state.last_actions}
+    others = {name: getattr(state, name) for name in ("focal_point", "age", "last_actions", "owed")}
+    return core | {name: value for name, value in others.items() if value is not None}

@@ -30,11 +30,15 @@ SENSORS = {
     "bilinear": ["experiment=logpolar", "sensor.sampling=bilinear", "sensor.radius=20"],
     "whole": ["experiment=nonfoa"],
 }
+PER_SACCADE = ["gaze.cost=0.3", "gaze.cost_per=saccade"]
 EPISODES = {
     "learned": ["experiment=constant70_p_packed"],
     "canvas": ["experiment=decreasing_p", "gaze.bounds=point", "gaze.actions=9", "gaze.step=11"],
-    "several sizes": ["experiment=constant50_sub2_packed", "gaze.step=[3,20]", "gaze.bounds=fovea"],
-    "absolute": ["experiment=constant50_sub2_packed", "gaze.moves=absolute", "gaze.grid=[3,4]", "gaze.bounds=point"],
+    "several sizes": ["experiment=constant50_sub2_packed", "gaze.step=[3,20]", "gaze.bounds=fovea", *PER_SACCADE],
+    "absolute": [
+        *("experiment=constant50_sub2_packed", "gaze.moves=absolute", "gaze.grid=[3,4]", "gaze.bounds=point"),
+        "gaze.cost=0.05",
+    ],
     "log-polar": ["experiment=logpolar", "gaze.step=7", "gaze.start=[70,3]"],
     "none": ["experiment=nonfoa"],
     "frozen": ["experiment=constant50_sub1_packed", "gaze=frozen", "gaze.start=[20,60]"],

@@ -38,10 +38,12 @@ np.save(sys.argv[3], results)
 """
 
 
-@pytest.fixture(scope="module", params=["experiment=constant70_p_packed", "experiment=nonfoa"])
+@pytest.fixture(
+    scope="module", params=["experiment=constant70_p_packed gaze.moves=absolute gaze.cost=0.1", "experiment=nonfoa"]
+)
 def stored(request, make_stored):
-    """A small agent, with a gaze and without."""
-    return make_stored(request.param)
+    """A small agent, with a gaze whose moves have a price and without."""
+    return make_stored(*request.param.split())
 
 
 @pytest.fixture(scope="module")
