@@ -68,7 +68,8 @@ def match(frame_shape: tuple[int, int]) -> Task:
 def memory(frame_shape: tuple[int, int]) -> Task:
     """`match`, but the cue shows at time 0 alone, and the action at time 3 alone is scored.
 
-    Optimal value gamma^(3 - time), return 1; without memory both are 0.
+    Optimal value gamma^(3 - time), return 1; without memory both are 0. A core that is told the last action needs
+    none: actions can carry the cue on (`network.last_actions=false`).
     """
 
     def reward(state: ProbeState, chosen: Int[Array, ""]) -> Float[Array, ""]:

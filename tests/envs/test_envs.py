@@ -193,7 +193,7 @@ def test_a_life_lost_at_the_step_limit_is_a_terminal(engine):
     np.testing.assert_array_equal(run.frame[50], run.frame[0])
 
 
-@pytest.mark.parametrize(("engine", "clip"), [("envpool", True), ("ale", True), ("ale", False)])
+@pytest.mark.parametrize(("engine", "clip"), [(engine, clip) for engine in ENGINES for clip in (True, False)])
 def test_rewards_are_clipped_and_scores_are_not(engine, clip):
     environment = make(config("space_invaders", engine=engine, clip_rewards=clip), num_envs=2, seed=0)
     run = play(environment, random_actions(60, 2, environment.num_actions))
@@ -229,12 +229,13 @@ def test_frames_handed_out_stay_as_they_are(engine):
     environment.close()
 
 
-def test_sticky_actions_repeat_the_last_action():
-    actions = np.tile([[LEFT], [RIGHT]], (20, 1))
-    exact, sticky = (
-        play(make(config(noop_max=0, sticky_actions=p), num_envs=1, seed=0), actions).frame[:24] for p in (0.0, 0.9)
-    )
-    assert np.any(exact != sticky)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_sticky_actions_repeat_the_last_action(engine):
+    """Of an episode's start, whose action is none: the paddle stays where it is."""
+    for stickiness, moves in ((0.0, True), (0.999, False)):
+        environment = make(config(engine=engine, noop_max=0, sticky_actions=stickiness), num_envs=1, seed=0)
+        paddle = play(environment, np.full((12, 1), RIGHT)).frame[:, 0, 189:193, 8:152].max(1)
+        assert (paddle[-1] != paddle[0]).any() == moves
 
 
 def test_a_game_that_ends_in_the_no_ops_is_over_with_the_next_first_step():

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from foajax.config.parse import ConfigError
-from foajax.config.schema import GazeConfig
+from foajax.config.schema import GazeConfig, LogPolarSensor, RingSensor
 from foajax.sensors import gaze
+from foajax.sensors.registry import make_sensor
 
 FRAME = (80, 90)
 WINDOWS = [(70, 70), (71, 33), (80, 90), (1, 1)]
@@ -39,6 +40,16 @@ def test_limits_are_where_the_area_fits(bounds, window):
 def test_limits_by_hand():
     low, high = gaze.limits(gaze=GazeConfig(), window=(70, 70), frame_shape=(80, 80))
     assert low.tolist() == [35, 35] and high.tolist() == [45, 45]
+
+
+@pytest.mark.parametrize(
+    "sensor", [RingSensor(((7, 9, 1), (20, 30, 2))), LogPolarSensor(rings=4, wedges=8, fovea=3.0, radius=14.0)]
+)
+def test_what_stays_inside_the_frame_is_the_area_or_its_finest_part(sensor):
+    finest, whole = ((7, 9), (20, 30)) if isinstance(sensor, RingSensor) else ((6, 6), (28, 28))
+    for each in (sensor, make_sensor(sensor)):
+        assert gaze.bounded(GazeConfig(bounds="fovea"), each) == finest
+        assert gaze.bounded(GazeConfig(bounds="window"), each) == whole
 
 
 @pytest.mark.parametrize("bounds", ["window", "point"])
