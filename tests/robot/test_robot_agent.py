@@ -22,7 +22,7 @@ Agent, AgentError = robot.Agent, robot.AgentError
 
 RINGS = "sensor.rings=[[21,18,1],[40,44,3],[64,60,5]]"  # areas that blocks do not divide
 SENSORS = {
-    "canvas": [RINGS, "sensor.peripheral=[5,7]"],
+    "canvas": [RINGS, "sensor.peripheral=[5,7]", "gaze.bounds=point"],
     "packed": [RINGS, "sensor.peripheral=[5,7]", "sensor.layout=packed"],
     "strides": [RINGS, "sensor.peripheral=[7,5]", "sensor.layout=packed", "sensor.pooling=stride"],
     "no periphery": [RINGS],
