@@ -10,7 +10,9 @@ on even pixels too, shows where the object is and never what it is: that takes f
 fovea on the object. (A gaze that moves by an even number of pixels keeps a ring's blocks there.)
 A greedy 16x16 fovea that moves 4 or 8 pixels a step never loses the object, and can earn the 12
 points of who sees the whole frame. Frozen at the centre it sees the stripes 16% of the time, which
-with a memory of the last steps is worth 2.5 points; moving at random is worth about 3.
+with a memory of the last steps is worth 2.5 points; moving at random is worth about 3. All this
+is of agents that are not told the last reward (`network.last_reward=false`, as `experiment=seek`
+has it): it tells what the object was a step ago, which is worth 10.5 points to who sees nothing.
 """
 
 from __future__ import annotations

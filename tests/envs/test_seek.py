@@ -52,6 +52,12 @@ def test_who_sees_nothing_earns_nothing():
         assert abs(returns.mean()) < 1.5
 
 
+def test_the_last_reward_tells_what_the_object_was():
+    """Of each leg's steps only the first is a guess to who is told it; here the episode's very first is right."""
+    returns = play(lambda state, t: kinds(state, max(t - 1, 0)))
+    assert abs(returns.mean() - 10.5) < 0.3
+
+
 def test_the_object_is_drawn_where_and_as_the_state_says(episodes):
     draw = jax.jit(TASK.draw)
     for episode, t in ((0, 0), (1, 37), (2, STEPS)):
