@@ -92,7 +92,7 @@ class Agent:
             drawn = gaze["mode"] == "random"
             vision = int(self._random.integers(len(gaze["moves"]))) if drawn else self._choose(outputs["vision_logits"])
         self.core = {name: outputs[f"next_{name}"] for name in self.core}
-        moved = self.focal_point - self.looked_at
+        moved = (self.focal_point - self.looked_at) * (self.age > 0)  # a start that is set from outside is free
         self._due = gaze["cost"] * (np.hypot(*moved) if gaze["cost_per"] == "pixel" else moved.any())
         self.outputs, self.looked_at, self.last_actions = outputs, self.focal_point, (natural, vision)
         self.age, self.focal_point = self.age + 1, self._move(vision)

@@ -185,8 +185,8 @@ def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
         start = [size // 2 for size in frame_shape]
     if start != "random":
         start = np.clip(start, low, high).tolist()
-    facts = {"mode": look.mode, "relative": relative, "moves": moves.tolist(), "cost": look.cost}
-    facts["cost_per"] = look.cost_per
+    facts = {"mode": look.mode, "relative": relative, "moves": moves.tolist()}
+    facts |= {"cost": look.cost, "cost_per": look.cost_per}
     return facts | {"start": start, "path": path, "limits": [low.tolist(), high.tolist()]}
 
 

@@ -54,8 +54,8 @@ def inputs(agent: Agent, batch: int) -> Arrays:
     """Inputs of zeros, before the first episode.
 
     `frame` is what the environment shows, `reward` what the last action earned, `is_first` whether an episode begins
-    (memory, gaze and last actions of the state are not read then), `seed` that of what is drawn at this step, `greedy`
-    whether nothing is drawn; the others are the state.
+    (the state is not read then), `seed` that of what is drawn at this step, `greedy` whether nothing is drawn; the
+    others are the state.
     """
     given: Arrays = {
         "frame": np.zeros((batch, *agent.screen_shape), np.uint8),

@@ -30,11 +30,13 @@ SENSORS = {
     "bilinear": ["experiment=logpolar", "sensor.sampling=bilinear", "sensor.radius=20"],
     "whole": ["experiment=nonfoa"],
 }
-PER_SACCADE = ["gaze.cost=0.3", "gaze.cost_per=saccade"]
 EPISODES = {
     "learned": ["experiment=constant70_p_packed"],
     "canvas": ["experiment=decreasing_p", "gaze.bounds=point", "gaze.actions=9", "gaze.step=11"],
-    "several sizes": ["experiment=constant50_sub2_packed", "gaze.step=[3,20]", "gaze.bounds=fovea", *PER_SACCADE],
+    "several sizes": [
+        *("experiment=constant50_sub2_packed", "gaze.step=[3,20]", "gaze.bounds=fovea"),
+        *("gaze.start=random", "gaze.cost=0.3", "gaze.cost_per=saccade"),
+    ],
     "absolute": [
         *("experiment=constant50_sub2_packed", "gaze.moves=absolute", "gaze.grid=[3,4]", "gaze.bounds=point"),
         "gaze.cost=0.05",
@@ -85,6 +87,8 @@ def test_it_decides_as_the_jax_agent_does(words, make_stored, fill, decisions):
     for step, (output, network) in enumerate(recorded):
         if is_first[step]:
             agent.reset()
+            if stored.agent.config.gaze.start == "random":
+                agent.focal_point = np.array(output.focal_point[0])
         assert agent.focal_point.tolist() == output.focal_point[0].tolist()
         actions = agent.decide(screens[step], float(rewards[step]))
         assert agent.looked_at.tolist() == output.focal_point[0].tolist()
