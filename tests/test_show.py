@@ -145,7 +145,7 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
     "word, message",
     [
         ("sensor=constant71", "sensor=constant71: did you mean constant70? accepted is one of"),
-        ("sensor=rings", "sensor.rings: missing; accepted is sensor.rings=value: rings, innermost first"),
+        ("sensor=rings", "sensor.rings: missing; accepted is a list of one or more [height, width, factor] with "),
         (
             "sensor.ring=3",
             "sensor.ring=3: unknown key (did you mean sensor.rings?); accepted is one of rings, kind, peripheral, ",

@@ -1,6 +1,6 @@
-"""Makes a checked `Config` of `key=value` words, with the files of experiments/ and of a directory of one's own.
+"""Makes a checked `Config` from `key=value` words and from the files in experiments/ and in a directory of your own.
 
-Hydra and OmegaConf take a third of a second to import, so that is left to the functions that need them.
+Importing Hydra and OmegaConf takes a third of a second, so only the functions that need them do it.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from foajax.config.schema import (
 from foajax.config.shipped import experiments
 from foajax.config.table import defaults, groups
 
-# Sensors of one's own, by themselves.
+# The sections of `sensor`; each name is also a choice of `sensor=`.
 _KINDS: dict[str, type[Section]] = {"rings": RingSensor, "logpolar": LogPolarSensor, "own": OwnSensor}
 _PLANS = "plans"  # of experiments/; `foajax.reproduce` reads them, they are no group
-_WHOLE = "nonfoa"  # a sensor that has no gaze, and nothing around it to leave out
+_WHOLE = "nonfoa"  # the whole frame, which has no packed layout
 
 
 def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
@@ -64,7 +64,7 @@ def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None)
 
 
 def register() -> None:
-    """Tells Hydra what is in no file: the keys' defaults, sensors without a canvas, an experiment for each sensor."""
+    """Registers with Hydra what is in no file: the defaults, packed sensors, an experiment for each ring sensor."""
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance().store
@@ -79,18 +79,18 @@ def register() -> None:
 
 
 def list_experiments() -> list[str]:
-    """What `experiment=` accepts, sorted."""
+    """Lists what `experiment=` accepts, sorted."""
     return list(choices()["experiment"])
 
 
 def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> str:
-    """An override as Hydra is to read it. What is wrong with one alone is found here, to name it."""
+    """Returns an override as Hydra is to read it. Refuses a word that is wrong by itself, and so can name it."""
     override = parse_override(word)
     key, value = override.key_or_group, override.value()
     if override.is_delete() or override.package is not None or not key:
         raise refuse(one_line(word))
     if override.is_hydra_override():
-        raise refuse(one_line(word), accepted="the same with --multirun")
+        raise refuse(one_line(word), accepted="", why="keys of hydra need --multirun")
     if key == _PLANS:  # Hydra takes its directory for a group
         raise refuse(one_line(word), accepted=Config.model_fields, why="unknown key")
     text = override.get_value_string()
@@ -109,7 +109,7 @@ def checked(word: str, *, sweep: bool, config_dir: str | Path | None = None) -> 
 
 
 def parse_override(word: str) -> Any:
-    """One word as Hydra's parser understands it."""
+    """Parses a word as one of Hydra's overrides; raises `ConfigError` for any other word."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -120,7 +120,7 @@ def parse_override(word: str) -> Any:
 
 
 def from_node(node: Any, words: Collection[str] = ()) -> Config:
-    """A checked `Config` from an OmegaConf node. What `words` of a command line set stands above words of before."""
+    """Makes a checked `Config` from an OmegaConf node. A key that `words` set wins over an old name for it."""
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -132,8 +132,8 @@ def from_node(node: Any, words: Collection[str] = ()) -> Config:
         return from_mapping(OmegaConf.to_container(node, resolve=True, throw_on_missing=True))
     except MissingMandatoryValue as error:
         required = (key for group in groups(Config) for key in group.keys if key.default is ABSENT)
-        sentence = next((key.sentence for key in required if key.name == error.full_key), "")
-        accepted = with_sentence(f"{error.full_key}=value", sentence)
+        known = {key.name: with_sentence(key.accepted, key.sentence) for key in required}
+        accepted = known.get(str(error.full_key), f"{error.full_key}=value")
         raise refuse(str(error.full_key), accepted=accepted, why="missing") from None
     except OmegaConfBaseException as error:
         accepted = "a value or ${key} with another key's name"
@@ -141,7 +141,7 @@ def from_node(node: Any, words: Collection[str] = ()) -> Config:
 
 
 def _check_kind(sensor: Any, stated: Collection[str]) -> None:
-    """`ConfigError` where a word gives a sensor another kind and leaves it the keys of its old one."""
+    """Raises `ConfigError` if a word changes `sensor.kind` but the keys of another kind are left."""
     kind = sensor.get("kind") if isinstance(sensor, dict) else None
     cls = _KINDS.get(str(kind))
     if cls is not None and "sensor.kind" in stated and sensor.keys() - cls.model_fields.keys():
@@ -154,7 +154,7 @@ def _first_line(error: Exception) -> str:
 
 @functools.cache
 def _rings() -> tuple[str, ...]:
-    """The paper's sensors but for the whole frame: the files of rings that leave the layout open."""
+    """Lists the ring sensors of experiments/ that leave the layout open, without the whole frame."""
     files = (file for file in experiments().glob("sensor/*.yaml") if file.stem != _WHOLE)
     return tuple(
         sorted(file.stem for file in files if not {"kind", "layout"} & yaml.safe_load(file.read_text()).keys())
@@ -162,13 +162,13 @@ def _rings() -> tuple[str, ...]:
 
 
 def _packed() -> tuple[str, ...]:
-    """The same without the canvas around their values."""
+    """Lists the same sensors in the packed layout."""
     return tuple(f"{name}_packed" for name in _rings())
 
 
 @functools.cache
 def choices(config_dir: str | Path | None = None) -> dict[str, tuple[str, ...]]:
-    """The names that each group offers: those of experiments/, what is made of them, and those of `config_dir`."""
+    """Lists each group's choices: the files of experiments/ and of `config_dir`, and what `register` adds."""
     found: dict[str, set[str]] = {"sensor": {*_KINDS, *_packed()}, "experiment": {*_rings(), *_packed()}}
     for directory in [experiments()] + ([] if config_dir is None else [Path(config_dir)]):
         for file in directory.glob("*/*.yaml"):

@@ -1,6 +1,6 @@
-"""Groups of keys as frozen pydantic models; a mistake in one is a line with the key, its value and what is accepted.
+"""Sections of keys: frozen pydantic models, whose errors are one line with the key, its value and what is accepted.
 
-The keys themselves are in `foajax.config.schema`.
+The keys are in `foajax.config.schema`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
 
 ABSENT: Any = object()  # no value
-CODE = "package.module:Class"  # the kind of what is code from elsewhere
+CODE = "package.module:Class"  # how a part of the user's is named
 
 
 class ConfigError(ValueError):
@@ -30,10 +30,10 @@ def refuse(
     near: str | None = None,
     kind: type[ConfigError] = ConfigError,
 ) -> ConfigError:
-    """The error, to be raised, about a key's value, or about a word by itself.
+    """Makes the error about a key's value, or about a word by itself. The caller raises it.
 
-    `accepted` says in words what the value may be, or is all of its choices: the one nearest to the value, or to
-    `near`, is suggested before the others are listed. `why` says what is wrong where that is not plain.
+    `accepted` is a phrase or all choices. Of choices it suggests the one nearest to the value, or to `near`. `why` says
+    what is wrong where that is not plain.
     """
     given = key if value is ABSENT else f"{key}={brief(value)}"
     if not isinstance(accepted, str):
@@ -46,24 +46,24 @@ def refuse(
 
 
 def suggest(why: str, *names: str) -> str:
-    """What is wrong, with the first of the names that may have been meant."""
+    """Adds to `why` the first of the names that the user may have meant."""
     if not names:
         return why
     return f"{why} (did you mean {names[0]}?)" if why else f"did you mean {names[0]}?"
 
 
 def one_line(*parts: object) -> str:
-    """Words, or an error, as they fit into a line."""
+    """Joins words, or the lines of an error, into one line."""
     return " ".join(" ".join(map(str, parts)).split())
 
 
 def file_name(text: str) -> str:
-    """A text as a part of a file's name."""
+    """Replaces characters that are unusual in a file's name by hyphens."""
     return "".join(c if c.isalnum() or c in "_-." else "-" for c in text)
 
 
 def brief(value: object) -> str:
-    """A value in one line, of 200 characters at most, as a command line has it."""
+    """Formats a value for a message: one line of at most 200 characters, with YAML's null, true and false."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     plain = to_mapping(value)
@@ -72,7 +72,7 @@ def brief(value: object) -> str:
 
 
 class Frozen(dict):
-    """A mapping that can be hashed, as it does not change."""
+    """A mapping that cannot change, and so can be hashed."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
@@ -81,23 +81,23 @@ class Frozen(dict):
         return type(self), (dict(self),)
 
     def _fixed(self, *_: Any, **__: Any) -> Any:
-        raise TypeError("a configuration does not change")
+        raise TypeError("a configuration is frozen; foajax.config.parse.replace makes another")
 
     __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _fixed
 
 
 def _frozen(value: Any) -> Any:
-    """Lists, as YAML has them, as tuples, and mappings that can be hashed."""
+    """Turns lists into tuples and dicts into `Frozen`, so that the value can be hashed."""
     if isinstance(value, (list, tuple)):
         return tuple(map(_frozen, value))
     return Frozen({key: _frozen(each) for key, each in value.items()}) if type(value) is dict else value
 
 
 class Section(BaseModel):
-    """A group of keys, of which each has a type, bounds, a default and a sentence.
+    """A group of keys, each with a type, bounds, a default and a sentence.
 
-    It is frozen, can be hashed, and is exact: a bool is no int, a string no number; a float may be given as an int and
-    has to fit into float32, a tuple may be given as a list.
+    It is frozen and can be hashed. Types are exact: a bool is no int, a string no number. But an int may stand for a
+    float, and a list for a tuple. A float has to fit into float32.
 
     Raises:
       ConfigError: an unknown or a missing key, or a value of another type or out of range.
@@ -115,14 +115,14 @@ class Section(BaseModel):
         except ValidationError as error:
             raise _refused(error, type(self), named) from None
 
-    # Sections inside of others are then made without it, and their mistakes come to the outermost, which knows names.
+    # So pydantic makes inner sections without it, and their mistakes reach the outermost, which knows the whole names.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"{type(self).__name__}.{name}: is frozen; foajax.config.parse.replace makes another")
 
     def check(self) -> None:
-        """Raises `ConfigError` where keys do not fit each other, with a key's name in its section."""
+        """Raises `ConfigError` where keys contradict each other. It names a key without the section."""
 
     @model_validator(mode="after")
     def _check(self) -> Any:
@@ -134,7 +134,7 @@ class Section(BaseModel):
     def _exact(cls, value: Any, handler: Any) -> Any:
         found = _frozen(handler(_frozen(value)))
         if isinstance(found, float) and found != 0 and not 1e-37 <= abs(found) <= 1e38:
-            raise ValueError("a number (0, or of 1e-37 to 1e38)")  # others would be 0 or infinite in float32
+            raise ValueError(", in the range of float32 (1e-37 to 1e38)")
         if isinstance(found, int) and isinstance(value, float):
             raise ValueError  # 5.0 is equal to a choice of 5
         return found
@@ -144,26 +144,26 @@ SectionT = TypeVar("SectionT", bound=Section)
 
 
 def build(cls: type[SectionT], mapping: Any, key: str = "config") -> SectionT:
-    """A section from nested mappings, as of YAML."""
+    """Makes a section from nested mappings, such as YAML gives."""
     if not isinstance(mapping, Mapping):
         raise refuse(key, mapping, "a mapping")
     return cls(**{str(name): value for name, value in mapping.items()})
 
 
 def replace(section: SectionT, **changes: Any) -> SectionT:
-    """A section in which some keys have other values, checked."""
+    """Makes a checked copy of a section with other values for some keys."""
     return type(section)(**{**dict(section), **changes})
 
 
 def to_mapping(value: Any) -> Any:
-    """A section, or a value of one, as plain dicts, lists and scalars."""
+    """Converts a section, or a value in one, to plain dicts, lists and scalars."""
     if isinstance(value, (Section, Mapping)):
         return {key: to_mapping(each) for key, each in dict(value).items()}
     return [to_mapping(each) for each in value] if isinstance(value, (list, tuple)) else value
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and their values."""
+    """Yields each dotted key with its value."""
     for key, value in mapping.items():
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
@@ -178,19 +178,19 @@ def schema_of(cls: type[Section]) -> dict[str, Any]:
 
 
 def resolve(node: Mapping[str, Any], root: Mapping[str, Any]) -> dict[str, Any]:
-    """A node of a JSON schema, with what it refers to."""
+    """Merges a node of a JSON schema with the definition that it refers to."""
     reference = node.get("$ref", "").rpartition("/")[2]
     return {**root["$defs"][reference], **node} if reference else dict(node)
 
 
 def kinds(node: Mapping[str, Any], root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The sections that a key may hold, by their `kind`, where there are several."""
+    """Returns the sections that a key may hold, by their `kind`; empty for a key without kinds."""
     sections = (resolve(each, root) for each in node.get("oneOf", ()))
     return {each["properties"]["kind"].get("const", CODE): each for each in sections}
 
 
 def describe(node: Mapping[str, Any]) -> str:
-    """What a node of a JSON schema accepts, in words."""
+    """Says in words what a node of a JSON schema accepts."""
     if "accepted" in node:
         return node["accepted"]
     if "anyOf" in node:
@@ -229,7 +229,7 @@ def _describe_number(node: Mapping[str, Any], *, is_integer: bool) -> str:
 
 
 def _refused(error: ValidationError, cls: type[Section], data: Mapping[str, Any]) -> ConfigError:
-    """The first of the mistakes that pydantic has found, in our words; unknown keys come before others."""
+    """Makes our error of the first mistake that pydantic found. Unknown keys come before other mistakes."""
     first = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
     root = schema_of(cls)
     keys, value, node, around = _find(first["loc"], data, root)
@@ -246,16 +246,16 @@ def _refused(error: ValidationError, cls: type[Section], data: Mapping[str, Any]
         return refuse(name, accepted=with_sentence(describe(node), node.get("description", "")), why="missing")
     if first["type"] == "union_tag_invalid":
         return refuse(f"{name}.kind", value.get("kind"), kinds(node, root))
-    return refuse(name, value, str(cause or "") or describe(node))
+    return refuse(name, value, f"{describe(node)}{cause or ''}")
 
 
 def with_sentence(accepted: str, sentence: str) -> str:
-    """What a key accepts, with its sentence, for who has not given it."""
+    """Adds a key's sentence to what it accepts, for the error about a missing key."""
     return f"{accepted}: {sentence[:1].lower()}{sentence[1:].removesuffix('.')}" if sentence else accepted
 
 
 def _nearest(word: str, prefix: str, known: Iterable[str], root: Mapping[str, Any]) -> list[str]:
-    """The key that a word may stand for: the most similar one, if it is in the same section or very similar."""
+    """Finds the key that a misspelt word may mean: a similar one of its section, or a very similar one elsewhere."""
     places = {name: f"{prefix}{name}" for name in known}
     elsewhere = {dotted.rpartition(".")[2]: dotted for dotted in reversed(list(_dotted(root, root)))}
     for name in difflib.get_close_matches(word, {**elsewhere, **places}):
@@ -267,7 +267,7 @@ def _nearest(word: str, prefix: str, known: Iterable[str], root: Mapping[str, An
 
 
 def _dotted(node: Mapping[str, Any], root: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """The dotted keys of a schema, those of sections with kinds left out."""
+    """Yields the dotted keys of a schema, without those that depend on a `kind`."""
     for word, child in node.get("properties", {}).items():
         child = resolve(child, root)
         if "properties" in child:
@@ -279,7 +279,7 @@ def _dotted(node: Mapping[str, Any], root: Mapping[str, Any], prefix: str = "") 
 def _find(
     place: Sequence[int | str], value: Any, root: dict[str, Any]
 ) -> tuple[list[str], Any, dict[str, Any], dict[str, Any]]:
-    """The keys that lead to pydantic's place of a mistake, the value there, its schema, and its section's."""
+    """Follows pydantic's path to a mistake: the keys on the way, the value there, its schema, and its section's."""
     keys: list[str] = []
     node = around = root
     for part in place[:-2] if place and place[-1] == "[key]" else place:

@@ -1,4 +1,4 @@
-"""Finds the parts that a configuration names: one of the package's own, or `package.module:Name` of the user's."""
+"""Finds the parts that a configuration names: foajax's own by a word, the user's by `package.module:Name`."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from foajax.config.parse import one_line, refuse
 
 
 def is_code(name: str) -> bool:
-    """Whether a name is that of code, `package.module:Name`."""
+    """Whether a name is that of the user's code, `package.module:Name`."""
     return ":" in name
 
 
 def bind_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> functools.partial:
-    """What makes the part that `key=name` asks for, with these arguments, once it is called.
+    """Returns a function of no arguments that makes the part `key=name`.
 
-    A name of code imports its module: only what the user trusts.
+    A name of code imports its module, which runs it: pass only what the user trusts.
 
     Raises:
-      ConfigError: there is no such word, module or name in the module, or it takes other arguments than these.
+      ConfigError: the part cannot be found, or it does not take these arguments.
     """
     if not is_code(name) and name not in ours:
         raise refuse(key, name, (*ours, "package.module:Name"))
@@ -31,12 +31,13 @@ def bind_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **
         inspect.signature(make).bind(**arguments)
     except TypeError as error:
         names = [word for word in inspect.signature(make).parameters if word not in ("parent", "name")]  # Flax's own
-        raise refuse(key, name, f"arguments {', '.join(names) or 'none'}", why=one_line(error)) from None
+        accepted = f"arguments {', '.join(names)}" if names else "no argument"
+        raise refuse(key, name, accepted, why=one_line(error)) from None
     return functools.partial(make, **arguments)
 
 
 def make_part(key: str, name: str, ours: Mapping[str, Callable[..., Any]], /, **arguments: Any) -> Any:
-    """The part itself; `ConfigError` as of `bind_part`."""
+    """Makes the part `key=name`; raises `ConfigError` as `bind_part` does."""
     return bind_part(key, name, ours, **arguments)()
 
 
@@ -45,7 +46,7 @@ def _import(key: str, name: str) -> Callable[..., Any]:
     try:
         found: Any = functools.reduce(getattr, path.split("."), importlib.import_module(module))
     except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise refuse(key, name, f"package.module:Name ({one_line(error)})") from None
+        raise refuse(key, name, "package.module:Name", why=one_line(error)) from None
     if not callable(found):
-        raise refuse(key, name, "package.module:Name of something to call")
+        raise refuse(key, name, "package.module:Name of a class or a function")
     return found

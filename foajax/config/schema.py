@@ -1,4 +1,4 @@
-"""What a run is made of: every key with its type, its bounds, its default and a sentence on it, in one place.
+"""Defines every key of a run: its type, bounds, default and a sentence.
 
 Hydra's base configuration, `--help`, docs/keys.md and the errors come from here. Standard library and pydantic only.
 """
@@ -15,7 +15,7 @@ from pydantic import Discriminator, Field, Tag, field_validator
 
 from foajax.config.parse import CODE, Section, build, file_name, refuse
 
-# Words of before, which are still understood, and today's.
+# Old names of keys, which are still understood, and today's.
 RENAMED = {
     "env.groups": "env.num_groups",
     "learner.minibatches": "learner.num_minibatches",
@@ -27,7 +27,7 @@ RENAMED = {
 
 
 def _says(accepted: str) -> Any:
-    """What a type accepts, where that is not plain from the type."""
+    """Gives the words for what a type accepts, where `describe` cannot tell."""
     return Field(json_schema_extra={"accepted": accepted})
 
 
@@ -133,7 +133,7 @@ SensorConfig = RingSensor | LogPolarSensor | OwnSensor
 
 
 def _kind(value: Any) -> str | None:
-    """Which sensor a value is; rings where it is not said."""
+    """Tells which section a value of `sensor` belongs to: rings if it has no `kind`."""
     kind = str(value.get("kind", "rings")) if isinstance(value, Mapping) else getattr(value, "kind", None)
     return CODE if kind is not None and re.fullmatch(r"[\w.]+:[\w.]+", kind) else kind
 
@@ -181,7 +181,7 @@ class GazeConfig(Section):
 
     @property
     def sense_bounds(self) -> Literal["window", "point"]:
-        """`bounds` as sensing has them: where less than the whole area stays inside the frame, it may overhang."""
+        """The `bounds` to sense with: 'window' if the whole focal area stays in the frame, else 'point'."""
         return "window" if self.bounds == "window" else "point"
 
     @property
@@ -481,7 +481,7 @@ class Config(Section):
         self._check_counters()
 
     def _check_places(self) -> None:
-        """The focal area, its grid and its points lie inside of the frame."""
+        """Checks that the focal area, the grids and the focal points lie inside of the frame."""
         height, width = self.env.frame_shape
         frame = f"env.frame_shape={height}x{width}"
         if self.sensor.window is not None:
@@ -491,12 +491,12 @@ class Config(Section):
             raise refuse("sensor.peripheral", grid, f"a grid no finer than {frame}")
         if self.gaze.moves == "absolute" and (self.gaze.grid[0] > height or self.gaze.grid[1] > width):
             raise refuse("gaze.grid", self.gaze.grid, f"a grid no finer than {frame}")
-        for y, x in self.gaze.path + ((self.gaze.start,) if isinstance(self.gaze.start, tuple) else ()):
-            if not (0 <= y < height and 0 <= x < width):
-                raise refuse("gaze.start or gaze.path", (y, x), f"[y, x] inside {frame}")
+        for key, point in (("gaze.start", self.gaze.start), *(("gaze.path", point) for point in self.gaze.path)):
+            if isinstance(point, tuple) and not (0 <= point[0] < height and 0 <= point[1] < width):
+                raise refuse(key, point, f"[y, x] inside {frame}")
 
     def _check_map(self) -> None:
-        """Each cell of the priority map is a place that the gaze can choose."""
+        """Checks that each cell of the priority map is a place that the gaze can choose."""
         sensor = self.sensor
         cells = sensor.peripheral if isinstance(sensor, RingSensor) and sensor.layout == "packed" else None
         chosen = self.gaze.grid if self.gaze.moves == "absolute" else None
@@ -512,7 +512,7 @@ class Config(Section):
             raise refuse("env.num_groups", groups, f"a divisor of learner.num_minibatches={count}")
 
     def _check_counters(self) -> None:
-        """Each environment's steps and the updates are counted in 32 bits."""
+        """Limits `train.env_steps`: each environment's steps and the updates are counted in 32 bits."""
         learner, rollout = self.learner, self.env.num_envs * self.learner.rollout_length
         most = 2**31 // max(learner.rollout_length, learner.num_minibatches * learner.num_epochs) - 2
         if -(-self.train.env_steps // rollout) > most:
@@ -526,9 +526,9 @@ class Config(Section):
 
     @property
     def code(self) -> list[str]:
-        """What of it names code outside of foajax, which runs where the part is made.
+        """The `key=name` words that name code outside of foajax, which runs when the part is made.
 
-        Not `train.logger`: training alone makes that, from its own words, and nothing that reads a run or an agent.
+        `train.logger` is not among them: only training makes a logger, never what reads a run or an agent.
         """
         names = {"game": self.game, "sensor.kind": self.sensor.kind}
         names |= {"network.torso": self.network.torso, "network.core": self.network.core}
@@ -551,7 +551,7 @@ class Config(Section):
 
 
 def game_name(game: str) -> str:
-    """The snake-case name of an Atari game that has a name of Gymnasium's or EnvPool's; any other name as it is.
+    """Returns the snake-case name for Gymnasium's or EnvPool's name of an Atari game; any other name as it is.
 
     SpaceInvaders, ALE/SpaceInvaders-v5, SpaceInvadersNoFrameskip-v4 and SpaceInvaders-v5 are space_invaders.
     """
@@ -560,24 +560,25 @@ def game_name(game: str) -> str:
 
 
 def check_window(config: Config, window: tuple[int, int]) -> None:
-    """`ConfigError` unless the sensor's focal area fits into the frame and the gaze can move it."""
+    """Raises `ConfigError` unless the sensor's focal area fits into the frame and the gaze can move it."""
     (height, width), key = config.env.frame_shape, config.sensor.size_key
     frame, bounds = f"env.frame_shape={height}x{width}", config.gaze.bounds
     if (bounds == "window" or not config.sensor.may_overhang) and (window[0] > height or window[1] > width):
         raise refuse(key, window, f"a focal area inside {frame}")
     if config.gaze.mode in ("learned", "random") and bounds == "window" and window == (height, width):
-        raise refuse("gaze.bounds", bounds, f"point, or gaze=none: {key} fills {frame} and could not move")
+        why = f"the focal area of {key} fills {frame} and cannot move"
+        raise refuse("gaze.bounds", bounds, "point, or gaze=none", why=why)
 
 
 def check_address(key: str, value: str) -> None:
-    """`ConfigError`, about `key`, unless `value` says where other processes find the first one."""
+    """Raises `ConfigError` about `key` unless `value` has the form host:port."""
     host, _, port = value.rpartition(":")
     if host == "" or not port.isdecimal():
         raise refuse(key, value, "host:port of process 0")
 
 
 def check_shares(config: Config, shares: int, key: str, value: object) -> None:
-    """`ConfigError`, about `key`, unless `shares` devices can each have the same part of a minibatch."""
+    """Raises `ConfigError` about `key` unless `shares` devices can have equal parts of a minibatch."""
     size = config.env.num_envs // config.learner.num_minibatches
     if size % shares:
         parts = "env.num_envs / learner.num_minibatches"
@@ -585,7 +586,7 @@ def check_shares(config: Config, shares: int, key: str, value: object) -> None:
 
 
 def renamed(mapping: Mapping[str, Any], fixed: Collection[str] = ()) -> dict[str, Any]:
-    """A copy of nested mappings in which words of before are today's; those of today in `fixed` keep their values."""
+    """Copies nested mappings with today's names for old keys. A new name in `fixed` keeps its own value."""
     found = copy.deepcopy(dict(mapping))
     for old, new in RENAMED.items():
         *path, word = old.split(".")
@@ -600,5 +601,5 @@ def renamed(mapping: Mapping[str, Any], fixed: Collection[str] = ()) -> dict[str
 
 
 def from_mapping(mapping: Any) -> Config:
-    """Builds a checked `Config` from plain nested mappings, words of before included; raises `ConfigError`."""
+    """Makes a checked `Config` from nested mappings, which may have old keys; raises `ConfigError`."""
     return build(Config, renamed(mapping) if isinstance(mapping, Mapping) else mapping)

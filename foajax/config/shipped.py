@@ -1,4 +1,4 @@
-"""Files that come with the package: inside it when installed from a wheel, beside it in a checkout."""
+"""Finds the files that come with foajax: inside the package in a wheel, beside it in a checkout."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def agents() -> Path:
-    """The trained agents, a directory each."""
+    """Returns the directory of the trained agents, which has a directory for each."""
     return _find("agents")
 
 
 @functools.cache
 def experiments() -> Path:
-    """The base of every configuration, and its groups."""
+    """Returns the directory with base.yaml and the groups of choices."""
     directory = _find("experiments")
     if not (directory / "base.yaml").is_file():
-        raise refuse(str(_PACKAGE), accepted="a checkout or a wheel", why="experiments/base.yaml is missing")
+        raise refuse(str(_PACKAGE), accepted="a checkout or an installed wheel", why="experiments/base.yaml is missing")
     return directory
 
 
 def kept_runs() -> Path:
-    """What is kept of runs; in a checkout only."""
+    """Returns the directory of the kept runs, which only a checkout has."""
     return _PACKAGE.parent / "results" / "runs"
 
 

@@ -1,4 +1,4 @@
-"""Every key with its default, what it accepts and its sentence: for Hydra, for `--help`, and as docs/keys.md.
+"""Lists every key with its default, what it accepts and its sentence: for Hydra, `--help` and docs/keys.md.
 
 `python -m foajax.config.table > docs/keys.md` makes the page anew.
 """
@@ -24,7 +24,7 @@ lists the choices; `foajax train experiment=seek --cfg job` prints the values of
 
 
 class Key(NamedTuple):
-    """A key as it is shown."""
+    """A key as help shows it."""
 
     name: str  # dotted
     default: Any  # ABSENT where it has to be given
@@ -42,13 +42,13 @@ class Group(NamedTuple):
     """The keys of one section."""
 
     name: str  # dotted; empty for the outermost
-    kind: str  # where its keys depend on that
+    kind: str  # of the sensor, where its keys depend on that; else empty
     sentence: str
     keys: list[Key]
 
 
 def groups(cls: type[Section]) -> Iterator[Group]:
-    """The keys of a section and of those inside it, in their order."""
+    """Yields the keys of a section and of the sections inside it, in order."""
     root = schema_of(cls)
     return _groups(root, root)
 
@@ -72,7 +72,7 @@ def _groups(node: Mapping[str, Any], root: Mapping[str, Any], name: str = "", ki
 
 
 def defaults(cls: type[Section]) -> dict[str, Any]:
-    """The defaults as nested mappings, as Hydra has them: `???` where there is none; without what comes in kinds."""
+    """Returns the defaults nested, as Hydra has them: `???` for a required key; none for keys that depend on a kind."""
     found: dict[str, Any] = {}
     for group in groups(cls):
         section = found
@@ -84,7 +84,7 @@ def defaults(cls: type[Section]) -> dict[str, Any]:
 
 
 def listed(cls: type[Section]) -> str:
-    """The keys for a terminal, a line each."""
+    """Formats the keys for a terminal, one per line."""
     lines = []
     for group in groups(cls):
         if group.name:
@@ -94,12 +94,12 @@ def listed(cls: type[Section]) -> str:
 
 
 def page(cls: type[Section]) -> str:
-    """The keys as a page in Markdown."""
+    """Formats the keys as a page in Markdown."""
     return "\n".join([_PAGE, *tables(cls)]).rstrip()
 
 
 def tables(cls: type[Section]) -> list[str]:
-    """Lines of Markdown: a heading and a table for each section."""
+    """Formats a heading and a table for each section, as lines of Markdown."""
     lines = []
     for group in groups(cls):
         if group.name:

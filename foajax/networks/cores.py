@@ -53,7 +53,6 @@ class LSTM(nn.Module):
     forget_bias: float = 1.0
 
     def initial_state(self, batch: int) -> CoreState:
-        """Zeros."""
         zeros = jnp.zeros((batch, self.width))
         return CoreState(cell=zeros, hidden=zeros)
 
@@ -73,7 +72,6 @@ class GRU(nn.Module):
     forget_bias: float = 1.0
 
     def initial_state(self, batch: int) -> Float[Array, "B L"]:
-        """Zeros."""
         return jnp.zeros((batch, self.width))
 
     @nn.compact
@@ -107,7 +105,6 @@ class MinGRU(nn.Module):
     forget_bias: float = 1.0
 
     def initial_state(self, batch: int) -> Float[Array, "B L"]:
-        """Zeros."""
         return jnp.zeros((batch, self.width))
 
     @nn.compact
@@ -129,14 +126,13 @@ class MinGRU(nn.Module):
 
 
 class Memoryless(nn.Module):
-    """No memory, for a control: a dense layer in its place, which sees what is told beside the images too."""
+    """No memory, for a control: a dense layer in its place, which reads the same inputs."""
 
     width: int
     norm: bool = True
     forget_bias: float = 0.0  # nothing is kept
 
     def initial_state(self, batch: int) -> tuple[()]:
-        """Nothing."""
         return ()
 
     @nn.compact
@@ -150,7 +146,7 @@ CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Memoryless}  # by `
 
 
 def make_core(config: NetworkConfig) -> Any:
-    """The core that a network has; a Flax module.
+    """Makes the core that `network.core` names, a Flax module.
 
     Raises:
       ConfigError: `network.core` names code that cannot be found, takes other arguments or is no core.
@@ -159,15 +155,15 @@ def make_core(config: NetworkConfig) -> Any:
     arguments = dict(config.core_kwargs) if is_code(config.core) else own | dict(config.core_kwargs)
     made = make_part("network.core", config.core, CORES, **arguments)
     if not (isinstance(made, nn.Module) and isinstance(made, Core)):
-        raise refuse("network.core", config.core, "a Flax module with the methods of a Core")
+        raise refuse("network.core", config.core, "a Flax module with the methods of foajax.networks.cores.Core")
     return made
 
 
 def _project(inputs: Float[Array, "T B F"], biases: Sequence[float], core: Any, prefix: str = "") -> Array:
-    """The input's part of each gate, [T, B, gates * width], for all steps at once and outside of any loop.
+    """Computes the inputs' part of each gate, [T, B, gates * width], for all steps at once and outside of any loop.
 
-    `biases` are the gates', before learning: with a positive one a gate that keeps is open, and memory lasts some
-    steps (Jozefowicz et al. 2015).
+    `biases` are the gates' initial biases. A positive one opens a gate that keeps, so that memory lasts some steps
+    (Jozefowicz et al. 2015).
     """
 
     def init(key: Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Array:
@@ -186,6 +182,6 @@ def _project(inputs: Float[Array, "T B F"], biases: Sequence[float], core: Any, 
 
 
 def _orthogonal(key: Array, width: int, gates: int) -> Array:
-    """Each gate's recurrent matrix is orthogonal of its own."""
+    """Draws an orthogonal recurrent matrix for each gate."""
     make = nn.initializers.orthogonal(1.0)
     return jnp.concatenate([make(k, (width, width)) for k in jax.random.split(key, gates)], axis=-1)

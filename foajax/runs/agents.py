@@ -118,13 +118,13 @@ class TrainedAgent:
 
 
 def save_facts(agent: Agent, directory: Path, **more: Any) -> None:
-    """Writes what `load_agent` needs beside `config.yaml`, and more facts if there are."""
+    """Writes agent.json: what `load_agent` needs beside `config.yaml`, and `more` facts."""
     facts = {"num_actions": agent.num_actions, "crop_top": agent.crop_top}
     durable.replace(directory / FACTS, (json.dumps(facts | more) + "\n").encode())
 
 
 def load_score(path: str | Path) -> dict[str, Any] | None:
-    """What `evaluate` found of a shipped agent: mean, stderr, episodes, policy; None where nobody has said."""
+    """Reads what `evaluate` found of a shipped agent: mean, stderr, episodes, policy; None if nothing is stored."""
     try:
         return json.loads((find(path) / FACTS).read_text()).get("score")
     except (OSError, ValueError, AttributeError):
@@ -132,16 +132,16 @@ def load_score(path: str | Path) -> dict[str, Any] | None:
 
 
 def find(path: str | Path) -> Path:
-    """The directory that `run=` names: a path, else a shipped agent's name."""
+    """Returns the directory that `run=` names: a path or, if that is no run or agent, a shipped agent's name."""
     path, shipped = Path(path), agents() / path
     return shipped if not (path / "config.yaml").exists() and (shipped / "config.yaml").exists() else path
 
 
 def find_config(path: str | Path, key: str = "run") -> Config:
-    """The configuration of the run or the agent that `key` names.
+    """Reads the configuration of the run or the agent that `key` names.
 
     Raises:
-      ConfigError: there is none, which says what is shipped; or it cannot be read.
+      ConfigError: there is none (the message lists what is shipped), or it cannot be read.
     """
     shipped = sorted(file.parent.name for file in agents().glob("*/config.yaml"))
     return load_config(
@@ -150,10 +150,10 @@ def find_config(path: str | Path, key: str = "run") -> Config:
 
 
 def check_trust(path: Path, config: Config, trust: bool) -> None:
-    """`ConfigError` where a configuration from disk names code, which would run, and the user has not said so."""
+    """Raises `ConfigError` if a configuration from disk names code, which would run, and `trust` is false."""
     if config.code and not trust:
-        accepted = "trust=true where you trust whoever made it"
-        raise ConfigError(f"run={path}: it would run code, {', '.join(config.code)}; accepted is {accepted}")
+        why = f"it would run the code {', '.join(config.code)}"
+        raise refuse("run", path, "trust=true if you trust its author", why=why)
 
 
 def load_agent(path: str | Path, *, best: bool = False, trust: bool = False, key: str = "run") -> TrainedAgent:
@@ -184,18 +184,18 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False, key
     checkpoints = Checkpoints(path / CHECKPOINTS, keep=None)
     restored = checkpoints.restore({"train": template}, part=True, best=best)
     if restored is None:
-        raise refuse("run", path, "", why="has no checkpoint yet")
+        raise refuse("run", path, "", why="has no checkpoint yet; train it until one is saved")
     env_steps, state, _ = restored
     return TrainedAgent(agent, state["train"].params, state["train"].statistics, env_steps)
 
 
 def check_source(path: str) -> None:
-    """`ConfigError`, about `train.init_from`, where `path` is neither a run nor an agent."""
+    """Raises `ConfigError` about `train.init_from` if `path` is neither a run nor an agent."""
     find_config(path, "train.init_from")
 
 
 def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
-    """The state at the start of a run, with a stored agent's parameters and frame statistics.
+    """Returns the state at the start of a run with a stored agent's parameters and frame statistics.
 
     Raises:
       ConfigError: there is no such agent, or it has another network or other images.
@@ -219,7 +219,7 @@ def begin_from(path: str, state: TrainState, config: Config) -> TrainState:
 
 
 def _differences(stored: TrainedAgent, config: Config) -> str:
-    """What of another configuration may be why an agent's parameters do not fit it."""
+    """Lists the keys of a stored agent that may be why its parameters do not fit another configuration."""
     there, here = (dict(flatten(to_mapping(c))) for c in (stored.agent.config, config))
     groups = ("sensor", "network", "gaze", "env.color")
     differ = [key for key in there if key.startswith(groups) and here.get(key) != there[key]]
@@ -263,5 +263,5 @@ def _load_shipped(agent: Agent, file: Path, env_steps: int) -> TrainedAgent:
 
 
 def named(tree: Any) -> dict[str, Any]:
-    """Leaves by their path, e.g. `0/params/dense/kernel`; arrays on the host."""
+    """Returns the leaves by their path, e.g. `0/params/dense/kernel`; JAX's arrays are brought to the host."""
     return {n: np.asarray(x) if isinstance(x, jax.Array) else x for n, x in named_leaves(tree).items()}

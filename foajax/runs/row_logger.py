@@ -42,7 +42,6 @@ class WandB:
         self._run.define_metric("*", step_metric="env_steps")  # its own steps may not go back, a resumed run's do
 
     def log(self, row: Mapping[str, float], env_steps: int) -> None:
-        """A row."""
         self._run.log({**row, "env_steps": env_steps})
 
     def close(self) -> None:
@@ -51,7 +50,7 @@ class WandB:
 
 
 def find_logger(config: Config) -> Callable[[], RowLogger] | None:
-    """What makes the logger that `train.logger` names; None where it names none. Imports it: only what the user trusts.
+    """Returns what makes the logger that `train.logger` names, or None. It imports code that the user trusts.
 
     Raises:
       ConfigError: it cannot be found, or it takes other arguments than `train.logger_kwargs`.
@@ -75,4 +74,4 @@ def _check_wandb(kwargs: Mapping[str, Any]) -> None:
     known = inspect.signature(wandb.init).parameters
     for key in kwargs:
         if key not in known:
-            raise refuse(f"train.logger_kwargs.{key}", kwargs[key], known, why="wandb.init has no such", near=key)
+            raise refuse(f"train.logger_kwargs.{key}", kwargs[key], known, why="unknown to wandb.init", near=key)
