@@ -61,11 +61,11 @@ class AleEnvironment:
         return first_step(screen[:, 0])
 
     def send(self, action: np.ndarray) -> None:
-        """Starts a step. After a lost life ale-py would take the action: it gets FIRE instead."""
+        """Starts a step. In the step after an episode's end ale-py gets FIRE, or a no-op, in place of the action."""
         self._env.send(np.where(self._ended, self._restart, action).astype(np.int32))
 
     def recv(self) -> tuple[TimeStep, Outcome]:
-        """The step; points made by the FIRE after a lost life count in the score alone."""
+        """Waits for the step. Points made by the FIRE after a lost life count in the score, not in the reward."""
         screen, points, terminated, truncated, info = self._env.recv()
         lives, score = info["lives"], points.astype(np.float32)
         lost = terminated & (lives > 0) & (lives < self.lives)
@@ -78,7 +78,7 @@ class AleEnvironment:
         return timestep, Outcome(score=score, is_over=is_over)
 
     def render(self) -> np.ndarray:
-        """Not offered: ale-py's vector environment keeps the frames' screens only."""
+        """Raises NotImplementedError: ale-py's vector environment keeps only the screens that it has shrunk."""
         raise NotImplementedError("env.engine=ale does not render")
 
     def close(self) -> None:

@@ -1,10 +1,9 @@
-"""The Atari games, whichever engine plays them.
+"""What both engines of the Atari games share.
 
-The Atari engines play the same games, not the same way. Where an episode begins, EnvPool makes its 0 to
-`env.noop_max` no-ops and then one more action, FIRE where the game has it (a no-op where not, or where
-`env.fire_on_reset` is off); ale-py makes FIRE first and counts it among the no-ops. After a lost life EnvPool begins
-with no-ops and FIRE again, ale-py with FIRE alone. With `env.full_action_space` each game has FIRE. Neither engine can
-be saved: a resumed run starts new games.
+They start games in different ways. At an episode's start EnvPool makes 0 to `env.noop_max` no-ops and then one more
+action: FIRE if the game has it and `env.fire_on_reset` is set, else a no-op. ale-py makes FIRE first and counts it
+among the no-ops. After a lost life EnvPool makes no-ops and FIRE again, ale-py FIRE alone. With
+`env.full_action_space` each game has FIRE. Neither engine can be saved: a resumed run starts new games.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ def is_atari(config: Config) -> bool:
 
 
 def is_own(config: Config) -> bool:
-    """Whether it is made by code of the user's, `package.module:factory`."""
+    """Whether code of the user's makes the game, `package.module:factory`."""
     return ":" in config.game and not config.game.startswith(("gymnasium:", "probe:"))
 
 
 def atari_name(game: str, known: Iterable[str]) -> str:
-    """The snake-case name, e.g. beam_rider, of a game given by a name of any library's: BeamRider-v5, beamrider.
+    """Returns the snake-case name, e.g. beam_rider, for a name of any library's: BeamRider-v5, beamrider.
 
     Raises:
       ConfigError: if `known` does not have it; the message has the nearest name.
@@ -46,12 +45,12 @@ def atari_name(game: str, known: Iterable[str]) -> str:
 
 
 def envpool_id(name: str) -> str:
-    """EnvPool's id of a snake-case name: BeamRider-v5 of beam_rider."""
+    """Returns EnvPool's id for a snake-case name: BeamRider-v5 for beam_rider."""
     return "".join(part.capitalize() for part in name.split("_")) + "-v5"
 
 
 def check_game(config: Config) -> None:
-    """`ConfigError` where there is no such Atari game, or `env` does not suit it; others show once they are made."""
+    """Raises `ConfigError` if there is no such Atari game or `env` does not suit it. Others are checked when made."""
     if config.env.kwargs and not (is_own(config) or config.game.startswith("gymnasium:")):
         raise refuse("env.kwargs", config.env.kwargs, f"{{}} for game={config.game}")
     if config.env.color and config.game in OWN:
@@ -61,7 +60,7 @@ def check_game(config: Config) -> None:
 
 
 def atari_game(config: Config) -> tuple[str, int | None]:
-    """The engine's name of the game, and the first screen row kept of it; None where the whole screen is kept."""
+    """Returns the engine's name of the game and the first screen row to keep; None to keep the whole screen."""
     known: Sequence[str]
     if config.env.engine == "envpool":
         from envpool.atari.registration import atari_game_list as known
@@ -74,7 +73,7 @@ def atari_game(config: Config) -> tuple[str, int | None]:
 
 
 def screen_shape(config: Config) -> tuple[int, int]:
-    """Rows and columns of what an engine is asked for; `env.frame_shape` where it shrinks the screen itself.
+    """Returns the size of the screens to ask an engine for: `env.frame_shape` if the engine shrinks them.
 
     Both engines shrink by area means (OpenCV's INTER_AREA), as Gymnasium's AtariPreprocessing does.
     """

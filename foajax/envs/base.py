@@ -3,11 +3,11 @@
 All engines show an episode's end the same way (*next-step* auto-reset): the step that ends an episode gives its last
 frame; the step after it ignores its action and gives the next episode's first frame, with `is_first` and reward 0.
 
-For the learner an episode ends as a terminal when the game is over or, with `env.episodic_life`, when a life is
-lost; then the game goes on in the learner's next episode. At the step limit it ends without a terminal. (A game that
-ends early among the skipped frames shows the frame before once more.)
+For the learner an episode ends as a terminal when the game is over. With `env.episodic_life` a lost life ends it too,
+and the game goes on in the next episode. At the step limit it ends without a terminal. If a game ends within the
+skipped frames, the frame before is shown once more.
 
-`docs/extending.md` shows how to write one.
+`docs/extending.md` shows how to write an environment.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Environment(Protocol):
 
 
 def first_step(screen: np.ndarray) -> tuple[TimeStep, Outcome]:
-    """What `Environment.reset` gives, with these screens."""
+    """Returns what `Environment.reset` has to return, with these screens."""
     zeros, false = np.zeros(len(screen), np.float32), np.zeros(len(screen), bool)
     return TimeStep(screen, zeros, is_first=~false, is_terminal=false), Outcome(score=zeros, is_over=false)
 
@@ -74,7 +74,7 @@ def reads_gaze(environment: Environment) -> bool:
 
 
 def send(environment: Environment, action: np.ndarray, focal_point: Any) -> None:
-    """`environment.send`; one that reads the gaze is told where the screens were sensed, int32 [B, 2], too."""
+    """Calls `environment.send`, with the focal points, int32 [B, 2], if its rules depend on where the agent looked."""
     if reads_gaze(environment):
         cast(Any, environment).send(action, np.asarray(focal_point))
     else:
@@ -82,5 +82,5 @@ def send(environment: Environment, action: np.ndarray, focal_point: Any) -> None
 
 
 def facts(environment: Environment) -> dict[str, np.ndarray] | None:
-    """What the environment tells about its episodes as they stand, each [B, ...]; None where it tells nothing."""
+    """Returns the facts about the current episodes by name, each [B, ...]; None if the environment has none."""
     return cast(Any, environment).facts() if hasattr(environment, "facts") else None

@@ -60,11 +60,11 @@ class EnvPoolEnvironment:
         self._pool.send(action)
 
     def recv(self) -> tuple[TimeStep, Outcome]:
-        """The step, as EnvPool tells it.
+        """Waits for the step.
 
-        EnvPool flags the step limit alone where it falls together with a lost life or the game's end, and does not
-        tell of a game that ends during the no-ops after a lost life, except by the lives of the new one: then
-        `is_over` comes with that new episode's first step.
+        If the step limit coincides with a lost life or the game's end, EnvPool flags only the limit. If a game ends
+        during the no-ops after a lost life, EnvPool does not say so; the lives of the new game show it. Then
+        `is_over` comes with the new episode's first step.
         """
         screen, reward, terminated, truncated, info = self._pool.recv()
         lives, game_over = info["lives"], info["terminated"] == 1
@@ -81,7 +81,7 @@ class EnvPoolEnvironment:
         return timestep, Outcome(score=info["reward"], is_over=is_over)
 
     def render(self) -> np.ndarray:
-        """The emulators' screens now, uint8 [B, 210, 160, 3]; `recv` shows the brighter of the last two."""
+        """Returns the current screens, uint8 [B, 210, 160, 3]; `recv` shows the brighter of the last two."""
         return np.asarray(self._pool.render(np.arange(self.num_envs)))
 
     def close(self) -> None:
@@ -91,5 +91,5 @@ class EnvPoolEnvironment:
 
 
 def _screens(observation: np.ndarray) -> np.ndarray:
-    """EnvPool's [B, 1, H, W] as [B, H, W]; in colour, its [B, 3, H, W] as [B, H, W, 3]."""
+    """Turns EnvPool's [B, 1, H, W] into [B, H, W] or, in colour, its [B, 3, H, W] into [B, H, W, 3]."""
     return observation[:, 0] if observation.shape[1] == 1 else np.moveaxis(observation, 1, -1)

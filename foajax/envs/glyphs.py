@@ -1,10 +1,9 @@
 """Letters for search tasks: small bitmaps that can be told apart only at full resolution.
 
-A letter is the mask of a glyph of DejaVu Sans Bold, 11 pixels high, filled with a checkerboard of single pixels, on a
-plate of even gray. Any mean over a block of even sides sees the plate; of the letter it sees only the corners of its
-strokes, and with a sign that is drawn anew for each letter. The masks are smoothed, which makes that an eighth of the
-checkerboard's depth at most, and a 32nd in blocks of 4x4. So low resolution tells where a letter is,
-not which one or how it is turned.
+A letter is a glyph of DejaVu Sans Bold, 11 pixels high, filled with a checkerboard of single pixels, on a plate of even
+gray. The mean over a block of even sides is the plate's gray, except at the corners of strokes. There it is off by an
+eighth of the checkerboard's depth at most (a 32nd in blocks of 4x4), as the masks are smoothed, and with a random sign
+for each letter. So low resolution tells where a letter is, not which one or how it is turned.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _FONT_SIZE = 15  # gives capitals of 11 pixels
 
 @functools.cache
 def masks() -> Float[np.ndarray, "letters 4 p p"]:
-    """How much of each pixel of a plate a letter covers, 0 to 1; turned by 0, 90, 180 and 270 degrees to the left.
+    """Returns how much of each pixel of its plate a letter covers, 0 to 1, turned left by 0, 90, 180 and 270 degrees.
 
     The foot of a letter points down, right, up, left in this order.
     """
@@ -30,7 +29,7 @@ def masks() -> Float[np.ndarray, "letters 4 p p"]:
 
 
 def checkerboard() -> Float[np.ndarray, "p p"]:
-    """1 and -1 in turn, both ways."""
+    """Returns 1 and -1 in turn along rows and columns."""
     place = np.arange(PLATE)
     return np.where((place[:, None] + place) % 2 == 0, 1.0, -1.0).astype(np.float32)
 

@@ -1,8 +1,7 @@
 """Gymnasium's pixel environments as frames, gray or in colour: `gymnasium:<id>`, the id as `gymnasium.make` takes it.
 
-Of `env` only `frame_shape`, `color`, `clip_rewards`, `max_episode_steps` and the constructor's `kwargs` apply; skipped
-frames, no-ops, lives and sticky actions are an emulator's. An id may name the module that registers it, e.g.
-`gymnasium:my_package:MyGame-v0`.
+The keys of `env` that need an emulator do not apply: engine, threads, crop, full action space, skipped frames, no-ops,
+lives, FIRE, sticky actions. An id may name the module that registers it: `gymnasium:my_package:MyGame-v0`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ LUMA = np.array([299, 587, 114])  # thousandths of red, green and blue in gray (
 
 
 class GymnasiumEnvironment:
-    """A batch of one Gymnasium environment, an `envs.Environment`. They step one after another, in `recv`."""
+    """Copies of one Gymnasium environment as an `Environment`. They step one after another, in `recv`."""
 
     crop_top: int | None = None
     lives: np.ndarray | None = None
@@ -49,8 +48,10 @@ class GymnasiumEnvironment:
 
         try:
             self._env = SyncVectorEnv([make_one] * num_envs, copy=False, autoreset_mode=AutoresetMode.NEXT_STEP)
-        except (gymnasium.error.Error, ImportError, TypeError) as error:  # the last, of arguments that are missing
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
             accepted = "the id of an environment, or gymnasium:<module>:<id> with the module that registers it"
+            if isinstance(error, TypeError):
+                accepted = "env.kwargs that the constructor takes"
             missing = getattr(error.__cause__ or error, "name", None) if isinstance(error, ImportError) else None
             why = f"{missing} is missing (pip install {missing})" if missing else one_line(error).rstrip(".")
             raise refuse("game", config.game, accepted, why=why) from None
@@ -90,7 +91,7 @@ class GymnasiumEnvironment:
         return timestep, Outcome(score=score, is_over=self._ended)
 
     def render(self) -> np.ndarray:
-        """What the environments render, uint8 [B, h, w, 3], of one made with `render`; else their images."""
+        """Returns what the environments render, uint8 [B, h, w, 3], if made with `render`; else what they observe."""
         if self._env.render_mode == "rgb_array":
             return np.stack(self._env.render())
         image = self._image if self._image.ndim == 4 else self._image[..., None]
@@ -102,10 +103,9 @@ class GymnasiumEnvironment:
 
 
 def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
-    """Images, uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3] (RGB), as frames, uint8 [B, H, W] of `frame_shape`.
+    """Turns images, uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3] (RGB), into frames, uint8 [B, H, W] of `frame_shape`.
 
-    Gray by ITU-R BT.601, resized by area means, each rounded half up: what agents of Gymnasium environments see.
-    `ValueError` for anything else.
+    Gray by ITU-R BT.601, then resized by area means; both are rounded half up. Raises `ValueError` for other images.
     """
     if images.dtype != np.uint8 or not (images.ndim == 3 or (images.ndim == 4 and images.shape[-1] in (1, 3))):
         accepted = "uint8 [B, h, w], [B, h, w, 1] or [B, h, w, 3]"
@@ -117,7 +117,7 @@ def gray_frames(images: np.ndarray, frame_shape: tuple[int, ...]) -> np.ndarray:
 
 
 def make_frames(images: np.ndarray, frame_shape: tuple[int, ...], *, color: bool) -> np.ndarray:
-    """`gray_frames`; or with `color`, of uint8 [B, h, w, 3], frames [B, H, W, 3] whose channels are each resized so."""
+    """Makes `gray_frames` or, with `color`, frames [B, H, W, 3] of RGB images, each channel resized in the same way."""
     if not color:
         return gray_frames(images, frame_shape)
     return np.stack([gray_frames(images[..., channel], frame_shape) for channel in range(3)], axis=-1)
@@ -125,10 +125,10 @@ def make_frames(images: np.ndarray, frame_shape: tuple[int, ...], *, color: bool
 
 @functools.cache
 def area_weights(source: int, target: int) -> np.ndarray:
-    """[target, source] float32: the share of each source pixel in each target pixel, along one axis.
+    """Returns [target, source] float32: the share of each source pixel in each target pixel, along one axis.
 
-    Target pixel i covers source coordinates [i, i + 1) * source / target: a block mean where target divides source;
-    elsewhere, larger or smaller, border pixels count by the part that is covered. Each row sums to 1.
+    Target pixel i covers source coordinates [i, i + 1) * source / target: a block mean where target divides source.
+    Elsewhere border pixels count by the part that is covered. Each row sums to 1.
     """
     edges = np.arange(target + 1)[:, None] * source / target
     pixel = np.arange(source)[None, :]

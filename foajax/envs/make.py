@@ -1,4 +1,4 @@
-"""Makes the environment that plays a game, and tells what is known of a game before that."""
+"""Makes the environment that plays a game. Tells the names of its actions and its speed without making it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from foajax.envs.tasks import JaxEnvironment
 
 
 def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> Environment:
-    """The environment that plays `config.game`: an Atari game, one of `OWN`, `gymnasium:<id>` or
-    `package.module:factory`.
+    """Makes the environment that plays `config.game`.
 
     Args:
       config: `game` and `env` are read.
@@ -38,7 +37,7 @@ def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> E
         arguments = {**config.env.kwargs, "num_envs": num_envs, "seed": seed}
         made = make_part("game", config.game, {}, **arguments)
         if not isinstance(made, Environment):
-            raise refuse("game", config.game, "what makes all of a foajax.envs.base.Environment")
+            raise refuse("game", config.game, "a function that returns a foajax.envs.base.Environment")
         return made
     if config.game in OWN:
         return JaxEnvironment(OWN[config.game](config), num_envs=num_envs, seed=seed)
@@ -49,7 +48,7 @@ def make(config: Config, *, num_envs: int, seed: int, render: bool = False) -> E
 
 
 def action_names(config: Config) -> tuple[str, ...] | None:
-    """The natural actions' names, e.g. ("noop", "fire", "right", "left"); None where they have none.
+    """Returns the natural actions' names, e.g. ("noop", "fire", "right", "left"); None for a game without names.
 
     Raises:
       ConfigError: there is no such game.
@@ -72,16 +71,16 @@ def action_names(config: Config) -> tuple[str, ...] | None:
 
 
 def steps_per_second(config: Config) -> float:
-    """Agent steps in a second of the game: an Atari console shows 60 frames a second. 15 elsewhere, as with Atari."""
+    """Returns decisions per second of play: an Atari console shows 60 frames per second. Other games have 15."""
     return 60 / config.env.frame_skip if is_atari(config) else 15.0
 
 
 def make_environments(config: Config, env_steps: int, index: int = 0, count: int = 1) -> list[Environment]:
-    """The groups of environments of a run that starts at `env_steps`: process `index`'s part of each, of `count`."""
+    """Makes the groups of environments of a run that starts at `env_steps`, for process `index` of `count`."""
     batch, environments = config.env.num_envs // config.env.num_groups // count, []
     for group in range(config.env.num_groups):
-        # Apart for every run, group and start. An engine adds an environment's number: each is seeded alike whatever
-        # the number of processes.
+        # Differs between runs, groups and starts. An engine adds the environment's number: seeds do not depend on the
+        # number of processes.
         seed = int(np.random.SeedSequence([config.seed, env_steps, group]).generate_state(1)[0] >> 2)
         environments.append(make(config, num_envs=batch, seed=seed + index * batch))
     return environments

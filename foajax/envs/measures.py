@@ -1,4 +1,4 @@
-"""What episodes tell beside their score: facts of those that have ended, and the measures of visual search.
+"""Collects facts about episodes that have ended, and computes the measures of visual search from them.
 
 A fact is an array with one value per episode: see `foajax.envs.search.facts`.
 """
@@ -21,27 +21,27 @@ class FactsTracker:
         self._episodes: deque[Facts] = deque(maxlen=window)
 
     def add(self, facts: Mapping[str, np.ndarray], is_over: Bool[np.ndarray, "B"]) -> None:
-        """Takes in the facts, each [B, ...], of those of B episodes that are over."""
+        """Adds the facts, each [B, ...], of those of B episodes that are over."""
         for i in np.flatnonzero(is_over):
             self._episodes.append({name: np.array(values[i]) for name, values in facts.items()})
 
     def table(self) -> Facts:
-        """All of them, in the order in which the episodes ended; empty where none has."""
+        """Returns all facts in the order in which the episodes ended; empty before the first."""
         names = self._episodes[0] if self._episodes else ()
         return {name: np.array([facts[name] for facts in self._episodes]) for name in names}
 
 
 def pooled(tables: Iterable[Facts]) -> Facts:
-    """One table of several with the same facts."""
+    """Joins tables of the same facts into one."""
     tables = [table for table in tables if table]
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]} if tables else {}
 
 
 def summarise(facts: Facts) -> dict[str, float]:
-    """The measures of visual search over some episodes, by name; empty for facts of other tasks.
+    """Computes the measures of visual search over some episodes, by name; empty for facts of other tasks.
 
-    Episodes with several targets, a help in learning, are left out where there are others; `targets` says how many
-    there were on average.
+    If any episode has several targets (`search.staircase`), `targets` is their mean number. The other measures then
+    leave such episodes out, unless there are no others.
 
     - `accuracy`: share of right answers. `decisions`, `fixations`: how many an episode takes, until the answer.
     - `on_target`: share of the fixations that land on the target, where there is one.

@@ -1,4 +1,4 @@
-"""Tasks of our own, by the name that `game=` has for them."""
+"""The tasks that come with foajax, by their names in `game=`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Probe environments: tiny tasks with exactly known values, each of which tests one part of the agent.
 
 An agent that cannot learn `constant` has a broken value loss; `observation`, broken inputs; `delay`,
-broken discounting; `action`, a broken policy gradient; `match`, both together; `memory`, a broken
-recurrent core; `gaze`, a broken vision head. The game is called `probe:<name>`.
+broken discounting; `action`, a broken policy gradient; `match`, inputs and policy gradient together;
+`memory`, a broken recurrent core; `gaze`, a broken vision head. The game is called `probe:<name>`.
 
 A cue is a white half of the frame, left or right of the centre, for cue 0 or 1: it survives any
 normalisation, and a window around the centre shows it. Rewards lie in [-1, 1].
@@ -26,7 +26,7 @@ GAZE_LENGTH = 16
 
 
 class ProbeState(NamedTuple):
-    """All probes' state."""
+    """The state of every probe."""
 
     cue: Int[Array, ""]  # 0 or 1, drawn when the episode begins
     time: Int[Array, ""]  # steps taken
@@ -42,7 +42,7 @@ def constant(frame_shape: tuple[int, int]) -> Task:
 
 
 def observation(frame_shape: tuple[int, int]) -> Task:
-    """One action, one step; reward -1 where the left half is white, 1 where the right is. The value is that."""
+    """One action, one step; reward, and value, -1 where the left half is white, 1 where the right is."""
     return _task(frame_shape, num_actions=1, length=1, reward=lambda s, a: 2.0 * s.cue - 1, draw=_cue)
 
 

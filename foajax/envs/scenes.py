@@ -21,7 +21,7 @@ _CLUTTER = (4, 10)  # pixels of a bar's sides
 
 
 class Scene(NamedTuple):
-    """What is shown and what there is to find."""
+    """What a scene shows, and what there is to find in it."""
 
     image: UInt8[Array, "H W"]
     cue: UInt8[Array, "p p"]  # the target's letter, upright
@@ -34,7 +34,7 @@ class Scene(NamedTuple):
 def draw_scene(
     search: SearchConfig, frame_shape: tuple[int, int], key: Key[Array, ""], targets: Int[Array, ""], most: int
 ) -> Scene:
-    """A random scene with `targets` targets, at most `most`, or none in half of the scenes (`search.absent`)."""
+    """Draws a scene with `targets` targets, at most `most`; with `search.absent` half of the scenes have none."""
     count = max(search.set_sizes)
     place_key, scene_key, letter_key, noise_key = jax.random.split(key, 4)
     # One draw for all that is uniform: many small ones would take most of an episode's time.
@@ -63,15 +63,14 @@ def draw_scene(
 
 
 def _whole(share: Float[Array, "*n"], number: int) -> Int[Array, "*n"]:
-    """0 .. number - 1, equally likely where `share` is uniform in [0, 1)."""
+    """Turns uniform numbers in [0, 1) into integers 0 .. number - 1, equally likely."""
     return jnp.minimum((share * number).astype(jnp.int32), number - 1)
 
 
 def _places(
     key: Key[Array, ""], frame_shape: tuple[int, int], count: int, in_the_middle: Bool[Array, ""]
 ) -> Int[Array, "n 2"]:
-    """Upper left pixels of plates, one to a cell; the cells lie in the middle of the frame, and maybe the first one
-    in the middle of the cells."""
+    """Draws upper left pixels of plates, one per cell. With `in_the_middle` the first lies in the middle cell."""
     cell_key, jitter_key = jax.random.split(key)
     rows, columns = frame_shape[0] // CELL, frame_shape[1] // CELL
     middle = (rows - 1) // 2 * columns + (columns - 1) // 2
@@ -83,7 +82,7 @@ def _places(
 
 
 class Draws(NamedTuple):
-    """What is random about each letter: numbers in [0, 1)."""
+    """The random numbers in [0, 1) for each letter."""
 
     letter: Float[Array, "n"]
     dim: Float[Array, "n"]
@@ -96,7 +95,7 @@ class Draws(NamedTuple):
 def _letters(
     search: SearchConfig, each: Draws, asked: Int[Array, ""], is_target: Bool[Array, "n"]
 ) -> tuple[UInt8[Array, "n p p"], UInt8[Array, "p p"]]:
-    """The plates of a scene, and the cue."""
+    """Draws the plates with their letters, and the cue."""
     target, letters, is_bright = _what(search, each, is_target)
     # A letter that is the target's, too, is turned as the target may be.
     among = jnp.asarray(_TURNS[: search.classes])[_whole(each.turn, search.classes)]
@@ -110,7 +109,7 @@ def _letters(
 def _what(
     search: SearchConfig, each: Draws, is_target: Bool[Array, "n"]
 ) -> tuple[Int[Array, ""], Int[Array, "n"], Bool[Array, "n"]]:
-    """The target's letter, each letter, and which plates are bright."""
+    """Chooses the target's letter, each letter, and which plates are bright."""
     target, others = jnp.int32(0), jnp.ones_like(is_target, jnp.int32)  # a T among Ls
     if search.target == "cued":
         kinds = len(glyphs.LETTERS)
@@ -126,7 +125,7 @@ def _what(
 def _plates(
     search: SearchConfig, each: Draws, masks: Float[Array, "n p p"], is_bright: Bool[Array, "n"]
 ) -> UInt8[Array, "n p p"]:
-    """Letters on their plates, in random gray, contrast and sign."""
+    """Draws letters on plates, in random gray, contrast and sign."""
     low, high = (jnp.where(is_bright, bright, plain) for plain, bright in zip(_PLAIN, _BRIGHT, strict=True))
     gray = jnp.round(low + (high - low) * each.gray)
     contrast = search.contrast[0] + (search.contrast[1] - search.contrast[0]) * each.contrast
@@ -137,7 +136,7 @@ def _plates(
 
 
 def _bars(key: Key[Array, ""], count: int) -> UInt8[Array, "n p p"]:
-    """Clutter: a bar each, upright or lying, in random gray."""
+    """Draws bars as clutter, upright or lying, in random gray."""
     low, high = _PLAIN
     share, turn = jax.random.uniform(key, (2, count, 1, 1))
     place = np.abs(np.arange(glyphs.PLATE) - (glyphs.PLATE - 1) / 2)
@@ -149,7 +148,7 @@ def _bars(key: Key[Array, ""], count: int) -> UInt8[Array, "n p p"]:
 def _paste(
     scene: UInt8[Array, "H W"], patches: UInt8[Array, "n p p"], corners: Int[Array, "n 2"], shown: Bool[Array, "n"]
 ) -> UInt8[Array, "H W"]:
-    """The scene with the patches that are shown."""
+    """Pastes the patches that are shown into the scene."""
 
     def paste(scene: Array, item: tuple[Array, Array, Array]) -> tuple[Array, None]:
         patch, corner, is_shown = item
@@ -160,7 +159,7 @@ def _paste(
 
 
 def _noisy(key: Key[Array, ""], scene: UInt8[Array, "H W"], deviation: float) -> UInt8[Array, "H W"]:
-    """The scene with uniform noise of a standard deviation in gray levels."""
+    """Adds uniform noise of a standard deviation in gray levels."""
     if not deviation:
         return scene
     noise = (jax.random.bits(key, scene.shape, jnp.uint8).astype(jnp.float32) / 255 - 0.5) * (12**0.5 * deviation)

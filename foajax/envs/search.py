@@ -1,21 +1,20 @@
 """Visual search: the agent has to find one letter of a scene and look at it closely to answer.
 
-A scene is static. It has a number of letters on plates (`foajax.envs.glyphs`), one to a cell of 20 pixels, cells drawn
-without replacement, and each somewhere in its cell. One of them is the target: with `search.target=letter`, the one T
-among Ls. The task `search` asks which way its foot points. The task `detect` asks where it
-is: the answer "here" is right if the target lies inside the finest ring around the focal point, so this task reads the
-gaze.
+A scene is static. Its letters lie on plates (`foajax.envs.glyphs`), at random places in random cells of 20 pixels, one
+to a cell. One letter is the target: with `search.target=letter`, the only T among Ls. The task `search` asks which way
+its foot points. The task `detect` asks where it is: the answer "here" is right if the target lies inside the finest
+ring around the focal point.
 
-Who cannot read letters yet is best off guessing at once, and who guesses never learns to read. So training may begin
-with scenes full of targets, all turned alike, in half of which one lies in the middle (`search.staircase`): after a
-right answer an environment's next scene has one target fewer, after a wrong one two more. This is a weighted up-down
-staircase (Kaernbach 1991), which settles where two of three answers are right, or at one target. A scene without a
-target says nothing about how many are needed, and leaves the staircase where it is.
+An agent that cannot read letters yet earns most by guessing at once, and then never learns to read. So training may
+begin with scenes full of targets, all turned alike, in half of which one lies in the middle (`search.staircase`). After
+a right answer an environment's next scene has one target fewer, after a wrong one two more. This is a weighted up-down
+staircase (Kaernbach 1991). It settles where two of three answers are right, or at one target. A scene without a target
+leaves it where it is.
 
 Action 0 waits. Each decision costs `search.price`. An answer ends the episode: 1 if it is right, -1 if not; so does
 the `search.max_fixations`-th decision, which counts as a wrong answer where it only waits. Full sight earns
-`optimal_return`. One answer at once, whichever, is right a quarter of the time and earns -0.5 on average; with two
-classes, or where half of the scenes have no target, nobody who sees nothing can earn more than 0.
+`optimal_return`. Of four directions any answer at once is right a quarter of the time and earns -0.5 on average. With
+two, or where half of the scenes have no target, an agent that sees nothing earns 0 at most.
 """
 
 from __future__ import annotations
@@ -58,12 +57,12 @@ class SearchState(NamedTuple):
 
 
 def search(config: Config) -> Task:
-    """The rules of `game=search`."""
+    """Makes the rules of `game=search`."""
     return _task(config, here=False)
 
 
 def detect(config: Config) -> Task:
-    """The rules of `game=detect`."""
+    """Makes the rules of `game=detect`."""
     return _task(config, here=True)
 
 
@@ -72,7 +71,7 @@ def _task(config: Config, *, here: bool) -> Task:
     cells = (frame_shape[0] // scenes.CELL) * (frame_shape[1] // scenes.CELL)
     needed = max(search.set_sizes) + search.clutter
     if needed > cells:
-        accepted = f"at most {cells} letters and search.clutter together in env.frame_shape={list(frame_shape)}"
+        accepted = f"at most {cells} letters and bars (search.clutter) together in env.frame_shape={list(frame_shape)}"
         raise refuse("search.set_sizes", search.set_sizes, accepted)
     if config.sensor.finest is None:
         raise refuse("sensor.kind", config.sensor.kind, f"rings or logpolar for game={config.game}")
@@ -90,19 +89,19 @@ def _task(config: Config, *, here: bool) -> Task:
 
 
 def action_names(config: Config) -> tuple[str, ...]:
-    """The natural actions, in order."""
+    """Names the natural actions, in order."""
     answers = ("here",) if config.game == "detect" else DIRECTIONS[: config.search.classes]
     return ("wait", *answers, "absent") if config.search.absent else ("wait", *answers)
 
 
 def optimal_return(search: SearchConfig) -> float:
-    """The expected return of who sees the whole scene at full resolution, and in `detect` looks at the target."""
+    """Computes the expected return of an agent that sees all at full resolution and looks at the target of `detect`."""
     shown = 1 if search.target == "cued" else 0  # steps before the scene
     return 1.0 - search.price * (1 + shown)
 
 
 def facts(state: SearchState) -> dict[str, Array]:
-    """What there is to know about an episode when it has ended."""
+    """Returns the facts about an episode that has ended."""
     return {
         "set_size": state.set_size,
         "targets": state.targets,
@@ -150,14 +149,14 @@ def _start(
 def _follow(
     search: SearchConfig, frame_shape: tuple[int, int], here: bool, before: SearchState, key: Key[Array, ""]
 ) -> SearchState:
-    """The episode after `before`, one step further on the staircase."""
+    """Begins the episode after `before`, one step further on the staircase."""
     step = jnp.clip(before.step + jnp.where(before.right, -1, 2), 1, max(search.set_sizes))
     step = jnp.where(before.targets > 0, step, before.step)
     return _start(search, frame_shape, here, key, step)
 
 
 def _draw(search: SearchConfig, state: SearchState) -> UInt8[Array, "H W"]:
-    """The scene or, at the start of a `cued` episode, the cue in the middle of an empty frame."""
+    """Draws the scene or, at the start of a `cued` episode, the cue in the middle of an empty frame."""
     if search.target != "cued":
         return state.scene
     height, width = state.scene.shape
@@ -175,7 +174,7 @@ def _advance(
     action: Int[Array, ""],
     point: Int[Array, "2"],
 ) -> tuple[SearchState, Float[Array, ""], Bool[Array, ""]]:
-    """An action decided upon what was seen with the focal point at `point`."""
+    """Takes an action that was decided while looking at `point`; returns the next state, the reward and the end."""
     area = (point - np.array(fovea) // 2)[None], jnp.asarray([fovea])
     plates = state.boxes[:, :2], state.boxes[:, 2:]
     is_there = jnp.arange(len(state.boxes)) < state.targets
@@ -211,7 +210,7 @@ def _inside(inner: Box, outer: Box) -> Bool[Array, "*k"]:
 
 
 def _overlap(a: Box, b: Box) -> Float[Array, "*k"]:
-    """Intersection over union of two boxes."""
+    """Returns the intersection over union of two boxes."""
     sides = jnp.minimum(a[0] + a[1], b[0] + b[1]) - jnp.maximum(a[0], b[0])
     common = jnp.prod(jnp.maximum(sides, 0), axis=-1)
     return common / (jnp.prod(a[1], axis=-1) + jnp.prod(b[1], axis=-1) - common)

@@ -9,10 +9,10 @@ The stripes are one pixel wide and lie on even pixels, so that the mean of a blo
 on even pixels too, shows where the object is and never what it is: that takes full resolution, a
 fovea on the object. (A gaze that moves by an even number of pixels keeps a ring's blocks there.)
 A greedy 16x16 fovea that moves 4 or 8 pixels a step never loses the object, and can earn the 12
-points of who sees the whole frame. Frozen at the centre it sees the stripes 16% of the time, which
-with a memory of the last steps is worth 2.5 points; moving at random is worth about 3. All this
-is of agents that are not told the last reward (`network.last_reward=false`, as `experiment=seek`
-has it): it tells what the object was a step ago, which is worth 10.5 points to who sees nothing.
+points of an agent that sees the whole frame. Frozen at the centre it sees the stripes 16% of the
+time, which with a memory of the last steps is worth 2.5 points; moving at random is worth about 3.
+All this holds without the last reward (`network.last_reward=false`, as in `experiment=seek`): it
+tells what the object was a step ago, which is worth 10.5 points to an agent that sees nothing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SeekState(NamedTuple):
 
 
 def task(frame_shape: tuple[int, int]) -> Task:
-    """The rules, on frames of `frame_shape` (height, width)."""
+    """Makes the rules, on frames of `frame_shape` (height, width)."""
     return Task(
         num_actions=2,
         frame_shape=frame_shape,
@@ -54,12 +54,12 @@ def task(frame_shape: tuple[int, int]) -> Task:
 
 
 def current_kind(state: SeekState) -> Int[Array, ""]:
-    """The action, and stripes, that are right now: LEAVE or TAKE."""
+    """Returns the kind of the stripes, which is the right action: LEAVE or TAKE."""
     return state.kind[jnp.minimum(state.time // LEG, LEGS - 1)]
 
 
 def draw_object(frame_shape: tuple[int, int], corner: Int[Array, "2"], kind: Int[Array, ""]) -> UInt8[Array, "H W"]:
-    """A black frame with one object: 255 and 0 in stripes, horizontal for TAKE, vertical for LEAVE."""
+    """Draws one object on black: 255 and 0 in stripes, horizontal for TAKE, vertical for LEAVE."""
     y = jnp.arange(frame_shape[0])[:, None] - corner[0]
     x = jnp.arange(frame_shape[1])[None, :] - corner[1]
     inside = (y >= 0) & (y < SIZE) & (x >= 0) & (x < SIZE)

@@ -1,7 +1,7 @@
 """Environments that are pure JAX functions: the `Task`, its auto-reset, and the host's adapter.
 
-`reset` and `step` are one environment's and pure: vmap them over environments, scan them over time,
-and a whole loop runs on the device. `JaxEnvironment` puts them behind the host interface of `envs`.
+`reset` and `step` are pure and serve one environment: vmap them over environments, scan them over time, and a whole
+loop runs on the device. `JaxEnvironment` puts them behind the host's interface.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Task(NamedTuple):
 
 
 class EnvState(NamedTuple):
-    """All there is to know about one environment: what to save for a resumed run to go on bit for bit."""
+    """The whole state of one environment. A run that restores it goes on bit for bit."""
 
     task: TaskState
     key: Key[Array, ""]  # where the next episode's randomness comes from
@@ -57,7 +57,7 @@ class EnvState(NamedTuple):
 
 
 def observe(task: Task, state: EnvState) -> TimeStep:
-    """What `state` shows: a `TimeStep` without the batch."""
+    """Returns the `TimeStep` that `state` shows, without the batch."""
     return TimeStep(
         frame=task.draw(state.task),
         reward=state.reward,
@@ -67,7 +67,7 @@ def observe(task: Task, state: EnvState) -> TimeStep:
 
 
 def reset(task: Task, key: Key[Array, ""], before: TaskState | None = None) -> tuple[EnvState, TimeStep]:
-    """Begins the first episode, or the one that follows upon the last state of another."""
+    """Begins the first episode, or the one that follows `before`, the last state of another."""
     next_key, start_key = jax.random.split(key)
     start = task.start if task.follow is None or before is None else partial(task.follow, before)
     state = EnvState(
@@ -93,7 +93,7 @@ def step(
 def step_all(
     task: Task, state: EnvState, action: Int[Array, "B"], focal_point: Int[Array, "B 2"]
 ) -> tuple[EnvState, TimeStep]:
-    """`step` of B environments: the same results, but only those that begin an episode pay for its start."""
+    """Steps B environments as `step` does, but makes a start only for those that begin an episode."""
     over = state.is_terminal
     order = jnp.argsort(~over, stable=True)  # those that are over come first
 
@@ -145,33 +145,34 @@ class JaxEnvironment:
         return self.recv()
 
     def send(self, action: np.ndarray, focal_point: np.ndarray | None = None) -> None:
-        """Starts a step; `action` is int32 [B]. `focal_point`, int32 [B, 2], is where the last screens were sensed,
-        for a task that reads the gaze: (y, x) in pixels; None for the centre."""
+        """Starts a step with the actions, int32 [B]. For a task that reads the gaze, `focal_point`, int32 [B, 2], tells
+        where the last screens were sensed, (y, x) in pixels; None for the centre.
+        """
         point = self._centre if focal_point is None else focal_point
         self._state, self._timestep = self._step(self._state, jnp.asarray(action, jnp.int32), jnp.asarray(point))
 
     def recv(self) -> tuple[TimeStep, Outcome]:
-        """The step that `send` started, once it is there."""
+        """Waits for the step that `send` started."""
         timestep = TimeStep(*map(np.asarray, self._timestep))
         return timestep, Outcome(score=timestep.reward, is_over=timestep.is_terminal)
 
     def facts(self) -> dict[str, np.ndarray] | None:
-        """What the task tells about the episodes as they stand, each [B, ...]; None for one that tells nothing."""
+        """Returns the task's facts about the current episodes by name, each [B, ...]; None if it has none."""
         return None if self._facts is None else jax.tree.map(np.asarray, self._facts(self._state.task))
 
     def get_state(self) -> EnvState:
-        """Every environment's state, each field [B, ...]; between `recv` and `send`."""
+        """Returns every environment's state, each field [B, ...]. Call it between `recv` and `send`."""
         return self._state
 
     def set_state(self, state: EnvState) -> tuple[TimeStep, Outcome]:
-        """Goes on from `state`, in place of `reset`; gives the time step that it was saved at."""
+        """Goes on from `state`, in place of `reset`; returns the time step at which it was saved."""
         self._state, self._timestep = state, self._observe(state)
         return self.recv()
 
     def render(self) -> np.ndarray:
-        """The screens, uint8 [B, H, W, 3]."""
+        """Returns the screens, uint8 [B, H, W, 3]."""
         frame = np.asarray(self._timestep.frame)
         return frame if frame.ndim == 4 else np.repeat(frame[..., None], 3, axis=-1)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Does nothing: there is nothing to free."""

@@ -248,7 +248,9 @@ def test_noise_and_clutter_leave_the_letters_where_they_are():
     assert np.abs(busy.scene.astype(float) - 32).mean() > np.abs(plain.scene.astype(float) - 32).mean()
     background = busy.scene[plain.scene == 32].astype(float)
     assert 5 < background[np.abs(background - 32) < 20].std() < 7
-    with pytest.raises(ConfigError, match=r"search\.set_sizes=\[60\]: accepted is at most 64 letters and search.clutt"):
+    with pytest.raises(
+        ConfigError, match=r"search\.set_sizes=\[60\]: accepted is at most 64 letters and bars \(search.clutt"
+    ):
         search.search(configured("search.set_sizes=[60]", "search.clutter=5"))
 
 
