@@ -1,4 +1,4 @@
-"""What to do and where to look as one action, in the form that a library takes."""
+"""Joins what to do and where to look into one action, in the form that a library takes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Form = Literal["dict", "tuple", "multidiscrete"]
 
 
 def joint_space(form: Form, natural: spaces.Space, num_vision: int) -> spaces.Space:
-    """The space of one environment's actions.
+    """Returns the space of one environment's joint actions.
 
     - 'dict': {"natural": the environment's own, "vision": 0 .. num_vision - 1}
     - 'tuple': (natural, vision)
-    - 'multidiscrete': integers [natural, vision], or [..., vision] where the own ones are several already
+    - 'multidiscrete': integers [natural, vision], or [..., vision] where the own action has several numbers
 
-    `ConfigError` for another form, or 'multidiscrete' where the environment's own actions are not discrete.
+    Raises `ConfigError` for another form, or 'multidiscrete' where the environment's own actions are not discrete.
     """
     vision = spaces.Discrete(num_vision)
     if form == "dict":
@@ -36,12 +36,13 @@ def joint_space(form: Form, natural: spaces.Space, num_vision: int) -> spaces.Sp
 
 
 def split(form: Form, action: Any, natural: spaces.Space, num_vision: int, batch: tuple[int, ...]) -> tuple[Any, Any]:
-    """The environment's own actions and the visual ones, int32 of shape `batch`; `ConfigError` where they are none."""
+    """Splits actions into the environment's own and visual ones, int32 of shape `batch`; `ConfigError` for others."""
     own, vision = _parts(form, action, natural, batch)
     vision = np.asarray(vision)
     known = vision.shape == batch and np.issubdtype(vision.dtype, np.integer)
     if not known or (vision < 0).any() or (vision >= num_vision).any():
-        raise refuse("vision", vision, f"integers {list(batch)} from 0 to {num_vision - 1}")
+        accepted = f"integers {list(batch)}" if batch else "an integer"
+        raise refuse("vision", vision, f"{accepted} from 0 to {num_vision - 1}")
     return own, vision.astype(np.int32)
 
 
@@ -57,5 +58,5 @@ def _parts(form: Form, action: Any, natural: spaces.Space, batch: tuple[int, ...
     size = 2 if isinstance(natural, spaces.Discrete) else len(natural.nvec) + 1  # type: ignore[attr-defined]
     array = np.asarray(action)
     if array.shape != (*batch, size) or not np.issubdtype(array.dtype, np.integer):
-        raise refuse("action", action, f"integers {[*batch, size]}, natural and then vision")
+        raise refuse("action", action, f"integers {[*batch, size]}, natural before vision")
     return array[..., 0] if isinstance(natural, spaces.Discrete) else array[..., :-1], array[..., -1]

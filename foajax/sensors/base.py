@@ -1,6 +1,6 @@
-"""What a sensor is: the protocol, which one a configuration asks for, and what all of them share.
+"""What a sensor is: the protocol, and what all sensors share.
 
-`docs/extending.md` has a complete example of one's own.
+`docs/extending.md` has a complete example of one of your own.
 """
 
 from __future__ import annotations

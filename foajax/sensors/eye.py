@@ -1,4 +1,4 @@
-"""What the wrappers of environments have in common: a batch of gazes, and what is seen there."""
+"""What both wrappers of environments share: the gazes of a batch, and what is seen there."""
 
 from __future__ import annotations
 
@@ -41,22 +41,19 @@ class Seeing:
 
     @classmethod
     def of(cls, sensor: Any, frame_shape: tuple[int, int]) -> Seeing:
-        """`ConfigError` for what is no sensor."""
+        """Prepares a sensor; raises `ConfigError` for anything else."""
         if isinstance(sensor, RingSensor):
             shapes = (frame_shape,) if sensor.layout == "canvas" else ring_shapes(sensor)
             return cls(sensor, shapes, ring_count(sensor, frame_shape).actual)
         if isinstance(sensor, LogPolarSensor):
             return cls(sensor, ((sensor.rings, sensor.wedges),), sensor.rings * sensor.wedges)
-        from foajax.sensors.base import Sensor
         from foajax.sensors.registry import make_sensor
 
-        made = make_sensor(sensor) if isinstance(sensor, OwnSensor) else sensor
-        if not isinstance(made, Sensor):
-            raise refuse("sensor", sensor, "a RingSensor, a LogPolarSensor or a Sensor, or an experiment's name")
+        made = make_sensor(sensor)
         return cls(made, made.image_shapes(frame_shape), made.count(frame_shape).actual)
 
     def look(self, frames: np.ndarray, focal_points: np.ndarray, bounds: str) -> Images:
-        """The images [B, h, w, C] of frames [B, H, W, C]."""
+        """Senses frames [B, H, W, C]; returns images [B, h, w, C]."""
         if isinstance(self.sensor, RingSensor | LogPolarSensor):
             return host.sense_many(frames, focal_points, sensor=self.sensor, bounds=bounds)
         from foajax.sensors.compiled import sense_many
@@ -102,7 +99,7 @@ class Eye:
         self._owed = np.zeros(batch, np.float32)  # prices of these, which the next rewards pay
 
     def begin(self, which: Bool[np.ndarray, "B"], random: Callable[[], np.random.Generator]) -> None:
-        """Puts the gazes of new episodes at their start; what the old ones owe is forgiven."""
+        """Puts the gazes of new episodes at their start. Prices that the old episodes still owe are dropped."""
         self.focal_point = self.focal_point.copy()
         for i in np.flatnonzero(which):
             generator = random() if self._gaze.start == "random" else None
@@ -110,7 +107,7 @@ class Eye:
         self._saccade[which], self._owed[which] = 0, 0
 
     def move(self, vision: Int[np.ndarray, "B"], which: Bool[np.ndarray, "B"]) -> Float[np.ndarray, "B"]:
-        """Moves these gazes; gives the price of the moves before, which is due now (`learning.agent.Agent.act`)."""
+        """Moves these gazes; returns the price of the move before, which is due now (`learning.agent.Agent.act`)."""
         before, due = self.focal_point, np.where(which, self._owed, 0)
         self.focal_point = np.where(which[:, None], gazes.move(before, vision, **self._where), before)
         self._saccade = gazes.saccade(before, self.focal_point)
@@ -118,11 +115,11 @@ class Eye:
         return due
 
     def look(self, observation: Any) -> dict[str, Any]:
-        """What is seen of the batch's observations; the rest of a Dict is passed on."""
+        """Senses the batch's observations. The other entries of a Dict are passed on."""
         return self._rest(observation) | self._see(self._image(observation), self.focal_point)
 
     def look_one(self, observation: Any, i: int = 0) -> dict[str, Any]:
-        """What environment `i` sees of a single observation."""
+        """Senses a single observation with the gaze of environment `i`."""
         seen = self._see(self._image(observation)[None], self.focal_point[i : i + 1])
         return self._rest(observation) | {name: value[0] for name, value in seen.items()}
 
@@ -140,12 +137,12 @@ class Eye:
         return np.asarray(observation if self._pixels.key is None else observation[self._pixels.key])
 
     def _rest(self, observation: Any) -> dict[str, Any]:
-        """What is no image of a Dict, or of the space of one."""
+        """Returns the entries of a Dict, or of its space, other than the image."""
         key = self._pixels.key
         return {} if key is None else {name: value for name, value in observation.items() if name != key}
 
     def facts(self) -> dict[str, np.ndarray]:
-        """What the info dict has of each gaze: where it is, how far it moved, how many values it is shown a frame."""
+        """Returns the gazes' entries of the info dict: the focal point, its last move, the values shown per frame."""
         values = np.full(len(self._owed), self._seeing.count * self._pixels.channels)
         return {"focal_point": self.focal_point.copy(), "saccade": self._saccade.copy(), "values": values}
 
@@ -160,18 +157,18 @@ class Eye:
         return spaces.Dict({**rest, **ours})
 
     def _named(self, images: list) -> dict[str, Any]:
-        """Images under their names."""
+        """Names the images: `image`, or `image_0`, `image_1`, ... of several."""
         return {"image": images[0]} if len(images) == 1 else {f"image_{i}": x for i, x in enumerate(images)}
 
 
 def _check(gaze: Any, sensor: Any, frame_shape: tuple[int, int]) -> None:
-    """`ConfigError` unless a gaze moves by visual actions, and it and the sensor suit the frame."""
+    """Raises `ConfigError` unless visual actions move the gaze, and gaze and sensor suit the frame."""
     if not isinstance(gaze, GazeConfig):
         raise refuse("gaze", gaze, "a GazeConfig")
     if not gaze.learned:
-        raise refuse("gaze.mode", gaze.mode, "learned, for visual actions from outside")
-    # What a run is checked for, a wrapped environment is checked for too. But the whole frame may be a baseline
-    # here, which a gaze that has to move is refused.
+        raise refuse("gaze.mode", gaze.mode, "learned: in a wrapper visual actions move the gaze")
+    # The checks of a run, but for a gaze that stands still: here the whole frame may be a baseline, which a run whose
+    # gaze has to move is refused.
     still = replace(gaze, mode="frozen")
     known = sensor if isinstance(sensor, SensorConfig) else OwnSensor(kind=f"own:{type(sensor).__name__}")
     env = EnvConfig(frame_shape=frame_shape)

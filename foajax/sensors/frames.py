@@ -22,7 +22,7 @@ CROPPED = 160  # rows kept of an Atari screen
 
 
 def to_frame(screen: UInt8[Array, "h w *C"], crop_top: int | None) -> Float[Array, "H W *C"]:
-    """The frame that a sensor looks at, in [0, 1], of a screen in 0..255, gray or in colour.
+    """Turns a screen in 0..255, gray or in colour, into the frame that a sensor looks at, in [0, 1].
 
     With `crop_top` the screen is Atari's and the frame 80x80 (`crop_and_halve`); with None they have the same size.
     """
@@ -57,9 +57,9 @@ def frame_statistics(frame: Float[Array, "H W *C"]) -> tuple[Float[Array, ""], F
 def pixel_statistics(
     frame: Float[Array, "H W *C"], statistics: FrameStatistics
 ) -> tuple[Float[Array, "H W *C"], Float[Array, ""]]:
-    """One frame's part in statistics whose mean is by pixel: itself, and its deviation from the mean so far.
+    """Returns one frame's part in per-pixel statistics: the frame, and its deviation from the mean so far.
 
-    While nothing has been seen, the deviation is that of the frame's pixels from each other.
+    While nothing has been seen, it is the deviation from the frame's own mean.
     """
     mean, _ = _corrected(statistics, frame)
     return frame, jnp.sqrt(jnp.mean(jnp.square(frame - mean)))
@@ -104,15 +104,14 @@ def normalise(
     *,
     mode: Literal["running", "pixel", "frame", "none"],
 ) -> Float[Array, "H W *C"]:
-    """(frame - mean) / max(std, SMALLEST_STD), without bounds unless `none`.
+    """Returns (frame - mean) / max(std, SMALLEST_STD), which has no bounds; with `none` the frame as it is.
 
     Args:
       frame: in [0, 1].
       statistics: the running statistics, not yet bias-corrected; read by `running` and `pixel` only.
       mode: whose mean and deviation. `running` and `pixel`: those of `statistics`, bias-corrected, or
         the frame's own while nothing has been seen; with `pixel`, each pixel has a mean of its own,
-        so that what never changes is 0. `frame`: the frame's own; `none`: the frame is returned as
-        it is.
+        so that what never changes is 0. `frame`: the frame's own.
     """
     if mode == "none":
         return frame
@@ -121,7 +120,7 @@ def normalise(
 
 
 def _corrected(statistics: FrameStatistics, frame: Float[Array, "H W *C"]) -> tuple[Array, Array]:
-    """Mean and deviation without the bias of the zeros at the start; the frame's own while nothing has been seen."""
+    """Returns mean and deviation without the bias of starting at 0; the frame's own before anything was seen."""
     mean, std = frame_statistics(frame)
     seen = statistics.weight > 0
     weight = jnp.where(seen, statistics.weight, 1.0)

@@ -6,8 +6,8 @@ its finest part does; with bounds 'point', anywhere in the frame. With the last 
 The paper says only that visual actions "move the center of attention at every time-step" (Sec. III); the
 rest is ours.
 
-What a visual action is, `gaze.moves` says: a step from where the gaze is, or a cell of a grid to look at wherever
-the gaze was. A saccade may have a price (`price`).
+A visual action is a step from where the gaze is or, with `gaze.moves=absolute`, a cell of a grid to look at. A
+saccade may have a price (`price`).
 
 The functions take arrays of NumPy or of JAX and give the like. With JAX they are for one focal point, and the caller
 vmaps; NumPy's may have leading axes.
@@ -57,13 +57,13 @@ def move(
 
 
 def steps(gaze: GazeConfig) -> Int[np.ndarray, "V 2"]:
-    """What each visual action adds to the focal point, (y, x) in frame pixels, where moves are 'steps'."""
+    """Returns what each visual action adds to the focal point, (y, x) in frame pixels, where moves are 'steps'."""
     directions = DIRECTIONS[1 : gaze.actions]
     return np.concatenate([DIRECTIONS[:1], *(size * directions for size in gaze.sizes)])
 
 
 def targets(gaze: GazeConfig, frame_shape: Shape) -> Int[np.ndarray, "V 2"]:
-    """Where each visual action looks, (y, x) in frame pixels and not yet clipped, where moves are 'absolute'.
+    """Returns where each visual action looks, (y, x) in frame pixels and not yet clipped, where moves are 'absolute'.
 
     Cell i of n covers the pixels from i * size / n to (i + 1) * size / n; its centre is rounded down.
     """
@@ -72,7 +72,7 @@ def targets(gaze: GazeConfig, frame_shape: Shape) -> Int[np.ndarray, "V 2"]:
 
 
 def names(gaze: GazeConfig) -> tuple[str, ...]:
-    """What the visual actions are called: "stay", "up", ...; "up 16" with several step sizes; "row 1, column 4"."""
+    """Names the visual actions: "stay", "up", ...; "up 16" with several step sizes; "row 1, column 4"."""
     if gaze.moves == "absolute":
         rows, columns = gaze.grid
         return tuple(f"row {i + 1}, column {j + 1}" for i in range(rows) for j in range(columns))
@@ -83,7 +83,7 @@ def names(gaze: GazeConfig) -> tuple[str, ...]:
 
 
 def price(before: Int[Any, "*n 2"], after: Int[Any, "*n 2"], *, gaze: GazeConfig) -> Float[Any, "*n"]:
-    """What it costs to move the focal point, in units of reward: 0 for who stays.
+    """Returns the price of moving the focal point, in units of reward: 0 for a gaze that stays.
 
     `gaze.cost` times the Euclidean distance in frame pixels, or once for a move of any length. A move that the bounds
     shorten costs what is left of it.
@@ -127,7 +127,7 @@ def scripted(age: Int[Any, ""], *, gaze: GazeConfig, window: Shape, frame_shape:
 
 
 def bounded(gaze: GazeConfig, sensor: Any) -> Shape:
-    """Height and width of what has to stay inside the frame: the `window` of the functions of this module.
+    """Returns the size of what has to stay inside the frame: the `window` of the functions of this module.
 
     `sensor` is a `Sensor`, or the configuration of one.
     """
@@ -180,7 +180,7 @@ def _clip(point: Int[Any, "*n 2"], gaze: GazeConfig, window: Shape, frame_shape:
 
 
 def count(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> Int[np.ndarray, "H W"]:
-    """How many of the focal points (y, x) are at each pixel."""
+    """Counts the focal points (y, x) at each pixel."""
     counts = np.zeros(frame_shape, int)
     np.add.at(counts, tuple(points.T), 1)
     return counts

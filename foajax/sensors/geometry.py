@@ -1,4 +1,4 @@
-"""Where the sensors' values lie: blocks, cells, rings and wedges. NumPy alone, for every path that senses."""
+"""Computes where the sensors' values lie: blocks, cells, rings and wedges. It uses NumPy alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SAMPLES = 32  # sample points along each side of a cell, to measure how much of
 
 
 class PixelCount(NamedTuple):
-    """How many values a sensor gives of a gray frame, or of each channel of one in colour."""
+    """The number of values that a sensor gives of a gray frame, or of each channel of a frame in colour."""
 
     nominal: int  # as Table II counts: area over factor squared, ring by ring
     actual: int  # values really shown with the gaze at the frame's centre
@@ -61,13 +61,13 @@ def hidden_blocks(sensor: RingSensor) -> list[np.ndarray]:
 
 
 def ring_shapes(sensor: RingSensor) -> tuple[Shape, ...]:
-    """Of the rings in blocks and of the grid: the images of the packed layout."""
+    """Returns the shapes of the packed layout's images: the rings in blocks, then the grid."""
     shapes = [(-(-height // factor), -(-width // factor)) for height, width, factor in sensor.rings]
     return (*shapes, sensor.peripheral) if sensor.peripheral else tuple(shapes)
 
 
 def ring_count(sensor: RingSensor, frame_shape: Shape) -> PixelCount:
-    """The pixel budget of rings as Table II counts it, and what is really shown; see `Rings.count`."""
+    """Counts the pixel budget of rings as Table II does, and the values really shown; see `Rings.count`."""
     nominal, inner = 0.0, 0
     for height, width, factor in sensor.rings:
         nominal += (height * width - inner) / factor**2
@@ -84,41 +84,41 @@ def ring_count(sensor: RingSensor, frame_shape: Shape) -> PixelCount:
 
 
 def check_look(frame: Any, focal_point: Any, window: Shape, bounds: str) -> None:
-    """`ConfigError` unless a frame can be sensed at a focal point; arrays of NumPy or of JAX."""
+    """Raises `ConfigError` unless the frame can be sensed at the focal point; arrays of NumPy or of JAX."""
     if bounds not in ("window", "point"):
         raise refuse("bounds", bounds, "'window' or 'point'")
     if not np.issubdtype(focal_point.dtype, np.integer):
-        raise refuse("focal_point", focal_point.dtype, "integers, which foajax.sensors.gaze.from_unit makes")
+        raise refuse("focal_point.dtype", focal_point.dtype, "integers, which foajax.sensors.gaze.from_unit makes")
     if focal_point.shape != (2,):
-        raise refuse("focal_point", list(focal_point.shape), "(y, x), jax.vmap for more")
+        raise refuse("focal_point.shape", list(focal_point.shape), "[2], for (y, x); jax.vmap takes several")
     if frame.ndim not in (2, 3):
-        raise refuse("frame", list(frame.shape), "[H, W] or [H, W, C], jax.vmap for more")
+        raise refuse("frame.shape", list(frame.shape), "[H, W] or [H, W, C]; jax.vmap takes several")
     if bounds == "window" and (window[0] > frame.shape[0] or window[1] > frame.shape[1]):
         accepted = f"'point' where the focal area {window} exceeds {(frame.shape[0], frame.shape[1])}"
         raise refuse("bounds", "window", accepted)
 
 
 def move_inside(focal_point: Any, window: Shape, frame_shape: Shape) -> Any:
-    """The nearest focal points [..., 2] whose areas lie inside the frame, NumPy's or JAX's."""
+    """Returns the nearest focal points [..., 2] whose areas lie inside the frame, for arrays of NumPy or of JAX."""
     half, room = np.array(window) // 2, np.array(frame_shape) - window
     return focal_point.clip(half, half + room)
 
 
 def ring_edges(sensor: LogPolarSensor) -> np.ndarray:
-    """Radii [rings + 1] at which the rings begin and end, frame pixels: 0, fovea, ..., radius."""
+    """Returns the radii [rings + 1] at which the rings begin and end, frame pixels: 0, fovea, ..., radius."""
     growth = sensor.radius / sensor.fovea
     return np.concatenate([[0.0], sensor.fovea * growth ** (np.arange(sensor.rings) / (sensor.rings - 1))])
 
 
 def shares(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(cell, pixel of the window, weight) of all that is added up, sorted by cell; cells and pixels are numbered."""
+    """Returns (cell, pixel of the window, weight), sorted by cell: a cell's value is the weighted sum of its pixels."""
     return _bilinear_weights(sensor) if sensor.sampling == "bilinear" else _area_weights(sensor)
 
 
 def _bilinear_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Four (cell, pixel, weight) for each cell, sorted by cell.
+    """Returns the `shares` of the four pixels around each cell's centre.
 
-    The centre of a cell halves its angle and, but for the innermost ring, its logarithmic radius.
+    The centre halves the cell's angle and its logarithmic radius or, in the innermost ring, its radius.
     """
     edges = ring_edges(sensor)
     radius = np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])[:, None]
@@ -137,9 +137,9 @@ def _bilinear_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _area_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(cell, pixel, share of the cell's area in that pixel), sorted by cell.
+    """Returns `shares` whose weight is the part of the cell's area that lies in the pixel.
 
-    Measured with a grid of points in each cell, evenly spaced in area; ring by ring, to bound the memory.
+    It counts a grid of points in each cell, evenly spaced in area; ring by ring, to bound the memory.
     """
     fraction = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     wedge = np.arange(sensor.wedges)
@@ -156,7 +156,7 @@ def _area_weights(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.nd
 
 @functools.lru_cache
 def cell_of_pixel(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray]:
-    """For each pixel of the window [side, side], the cell that its centre lies in, and if it lies in any."""
+    """Returns, for each pixel of the window [side, side], the cell that its centre lies in, and if it lies in any."""
     offset = np.arange(sensor.window[0]) + 0.5 - sensor.window[0] / 2
     radius = np.hypot(offset[:, None], offset)
     ring = np.searchsorted(ring_edges(sensor)[1:], radius, side="right")

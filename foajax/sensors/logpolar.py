@@ -1,12 +1,12 @@
 """A log-polar retina: cells in rings around the focal point, growing with the distance from it.
 
-Geometry, ours. The focal point (y, x) means the corner between pixels (y - 1, x - 1) and (y, x), as
+The geometry is our choice. The focal point (y, x) means the corner between pixels (y - 1, x - 1) and (y, x), as
 for every area of even size, so that a disc of radius 40 fits an 80 x 80 frame exactly. The outer
 edges of the rings grow geometrically from `fovea` to `radius`; the innermost ring is the whole disc
 of radius `fovea`, so there is no blind spot. Wedge j spans the angles 2 pi [j, j + 1) / wedges, from
 the x axis towards the y axis: clockwise on the screen, as in OpenCV's `warpPolar`.
 
-Where pixels come from is worked out once per sensor, in NumPy; sensing is a gather and a weighted
+Which pixels make a cell is worked out once per sensor, in NumPy. Sensing is a gather and a weighted
 sum, at the same cost wherever the focal point is. Windows are squares of side 2 * ceil(radius).
 """
 
@@ -34,26 +34,22 @@ class LogPolar(Sensor):
 
     @property
     def finest(self) -> Shape:
-        """The square around the innermost disc."""
         return self.config.finest
 
     def sense(self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str) -> tuple[Array, ...]:
-        """The cells around the focal point."""
         return look(frame, focal_point, bounds, size=self.window, pool=self._warp)
 
     def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
-        """Rings and wedges, whatever the frame."""
         return ((self.config.rings, self.config.wedges),)
 
     def picture(
         self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
     ) -> Float[Array, "H W"]:
-        """The image warped back."""
         window = unwarp(images[0], sensor=self.config)
         return place(window, focal_point - np.array(self.window) // 2, frame_shape)
 
     def _warp(self, window: Num[Array, "side side"]) -> tuple[Float[Array, "rings wedges"]]:
-        """A window of the frame, seen by the retina; inner rings first, values not rescaled.
+        """Senses a window of the frame; inner rings come first, values are not rescaled.
 
         'bilinear' samples each cell's centre, between four pixels: sharp, but a cell larger than a few
         pixels misses what lies between the centres. 'area' takes the mean over each cell's area, which
@@ -65,17 +61,17 @@ class LogPolar(Sensor):
 
 
 def unwarp(image: Float[Array, "rings wedges"], *, sensor: LogPolarSensor) -> Float[Array, "side side"]:
-    """The inverse, for pictures: each pixel shows the cell that its centre lies in, 0 outside the disc."""
+    """Draws the image back: each pixel shows the cell that its centre lies in, 0 outside the disc."""
     cell, inside = cell_of_pixel(sensor)
     return jnp.where(inside, image.reshape(-1)[cell], 0.0)
 
 
 @functools.lru_cache
 def _tables(sensor: LogPolarSensor) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Pixel indices and weights, each [cells, k], for one run of rings after the other.
+    """Returns pixel indices and weights, each [cells, k], for one group of rings after the other.
 
-    Rows are padded to the same k with weight 0. Outer cells have more pixels: one k for all would
-    triple the work, so rings are grouped by k, within a factor of 1.4.
+    Rows are padded to k with weight 0. Outer cells have more pixels, and one k for all would triple the work. So the
+    rings are grouped by k, within a factor of 1.4.
     """
     cell, pixel, weight = shares(sensor)
     counts = np.bincount(cell, minlength=sensor.rings * sensor.wedges)

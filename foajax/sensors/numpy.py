@@ -1,7 +1,7 @@
 """The sensors in NumPy, without JAX: for forked processes, small machines and programs of other libraries.
 
-What they give equals `foajax.sense` and `foajax.picture` to rounding, which tests hold. `robot/agent.py` has a form of
-its own: it is one file that is copied out, for single frames, whose normalisation is part of the weights.
+Tests check that the results equal those of `foajax.sense` and `foajax.picture`, up to rounding. `robot/agent.py` has a
+form of its own: it is one file to be copied, for single frames, with the normalisation in the weights.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def sense(
     sensor: Any,
     bounds: str = "point",
 ) -> tuple[Float[np.ndarray, "_ _ _"], ...]:
-    """What a sensor sees of one frame; arguments, results and errors are those of `foajax.sense`.
+    """Returns what a sensor sees of one frame; arguments, results and errors are those of `foajax.sense`.
 
-    A sensor of one's own is refused: it is written in JAX.
+    It refuses a sensor of your own, which is written in JAX.
     """
     frame, focal_point = np.asarray(frame), np.asarray(focal_point)
     if not isinstance(sensor, RingSensor | LogPolarSensor):
-        raise refuse("sensor", sensor, "a RingSensor or a LogPolarSensor; foajax.sense takes one's own")
+        raise refuse("sensor", sensor, "a RingSensor or a LogPolarSensor; foajax.sense takes your own")
     check_look(frame, focal_point, sensor.window, bounds)
     frames = frame.reshape(1, *frame.shape[:2], -1)
     return tuple(image[0] for image in sense_many(frames, focal_point[None], sensor=sensor, bounds=bounds))
@@ -54,7 +54,7 @@ def picture(
     sensor: RingSensor | LogPolarSensor,
     frame_shape: Shape,
 ) -> Float[np.ndarray, "H W C"]:
-    """What `sense` gave, put back in the frame's place; as `foajax.picture`."""
+    """Draws what `sense` returned at its place in the frame, as `foajax.picture` does."""
     if isinstance(sensor, RingSensor) and sensor.layout == "canvas":
         return images[0]
     channels = images[0].shape[-1]
@@ -81,7 +81,7 @@ def sense_many(
     sensor: RingSensor | LogPolarSensor,
     bounds: str = "point",
 ) -> tuple[Float[np.ndarray, "B _ _ C"], ...]:
-    """What a sensor sees of many frames, each at a focal point of its own: `sense` for a batch, unchecked."""
+    """Senses many frames, each at a focal point of its own: `sense` for a batch, unchecked."""
     shape = (frames.shape[1], frames.shape[2])
     if bounds == "window":
         focal_points = move_inside(focal_points, sensor.window, shape)
@@ -108,7 +108,7 @@ def sense_many(
 
 
 def _cut(frames: np.ndarray, corners: np.ndarray, size: Shape) -> np.ndarray:
-    """Areas of `size` with their top-left pixels at `corners`, float32 [B, h, w, C]; 0 outside of the frames."""
+    """Cuts areas of `size` with their top-left pixels at `corners`: float32 [B, h, w, C], 0 outside of the frames."""
     windows = np.zeros((len(frames), *size, frames.shape[3]), np.float32)
     for window, frame, (top, left) in zip(windows, frames, corners.tolist(), strict=True):
         y, x = max(top, 0), max(left, 0)
@@ -118,7 +118,7 @@ def _cut(frames: np.ndarray, corners: np.ndarray, size: Shape) -> np.ndarray:
 
 
 def _pool(windows: np.ndarray, sensor: RingSensor) -> list[np.ndarray]:
-    """The mean of each block, ring by ring, nothing hidden yet; or its first pixel."""
+    """Returns each ring's blocks, before hiding: the mean of a block, or its first pixel."""
     parts = []
     for (height, width, factor), (top, left) in zip(sensor.rings, offsets(sensor), strict=True):
         area = windows[:, top : top + height, left : left + width]
@@ -132,7 +132,7 @@ def _pool(windows: np.ndarray, sensor: RingSensor) -> list[np.ndarray]:
 
 
 def _block_sums(x: np.ndarray, factor: int, axis: int) -> np.ndarray:
-    """Sums over consecutive `factor` rows or columns; the last block may have fewer. Faster than `np.add.reduceat`."""
+    """Sums every `factor` rows or columns; the last block may have fewer. Faster than `np.add.reduceat`."""
     x = np.moveaxis(x, axis, 0)
     sums = x[::factor].copy()
     for i in range(1, factor):
@@ -142,7 +142,7 @@ def _block_sums(x: np.ndarray, factor: int, axis: int) -> np.ndarray:
 
 
 def _cells(frames: np.ndarray, edges: list[np.ndarray], sensor: RingSensor) -> np.ndarray:
-    """The peripheral grid: the mean of each cell, or its first pixel, nothing hidden yet."""
+    """Returns the cells of the peripheral grid, before hiding: the mean of a cell, or its first pixel."""
     rows, columns = edges
     if sensor.pooling == "stride":
         return frames[:, rows[:-1]][:, :, columns[:-1]].astype(np.float32)
@@ -151,7 +151,7 @@ def _cells(frames: np.ndarray, edges: list[np.ndarray], sensor: RingSensor) -> n
 
 
 def _paint(images: tuple[np.ndarray, ...], sensor: RingSensor) -> np.ndarray:
-    """Every ring's values painted over the pixels of the focal area that they stand for, coarse to fine."""
+    """Paints every ring's values over the pixels of the focal area that they stand for, coarse to fine."""
     area = np.zeros((*sensor.window, images[0].shape[-1]), np.float32)
     rings = zip(images, sensor.rings, offsets(sensor), strict=False)  # the last image may be the grid
     for image, (height, width, factor), (top, left) in reversed(list(rings)):
@@ -162,7 +162,7 @@ def _paint(images: tuple[np.ndarray, ...], sensor: RingSensor) -> np.ndarray:
 
 @functools.lru_cache
 def _tables(sensor: LogPolarSensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pixel and the weight [n, 1] of all shares, sorted by cell, and where each cell's begin."""
+    """Returns the pixels and the weights [n, 1] of all `shares`, and where each cell's begin."""
     cell, pixel, weight = shares(sensor)
     first = np.searchsorted(cell, np.arange(sensor.rings * sensor.wedges))
     return pixel.astype(int), weight.astype(np.float32)[:, None], first

@@ -1,4 +1,4 @@
-"""Where the image is in another library's observation, and what its numbers mean."""
+"""Finds the image in another library's observation, and scales its values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ACCEPTED = (
 
 @dataclasses.dataclass(frozen=True)
 class Pixels:
-    """How one kind of image is read, and what sensors' images of it become."""
+    """How to read one kind of image, and what sensors' images of it become."""
 
     box: spaces.Box  # of one image
     key: str | None  # of the image in a Dict observation; None where it is the observation
@@ -29,14 +29,14 @@ class Pixels:
 
     @classmethod
     def of(cls, space: spaces.Space, key: str | None, dtype: str) -> Pixels:
-        """Finds the image; `ConfigError` where there is none, or its values do not fit `dtype`."""
+        """Finds the image; raises `ConfigError` where there is none, or its values do not fit `dtype`."""
         box = space
         if isinstance(space, spaces.Dict):
             if key not in space.spaces:
                 raise refuse("image_key", str(key), space.spaces.keys())
             box = space[key]
         elif key is not None:
-            raise refuse("image_key", key, f"none where the observation is no Dict but {brief(space)}")
+            raise refuse("image_key", key, f"None, because the observation is no Dict but {brief(space)}")
         axes = _axes(box.shape or ())
         numbers = box.dtype is not None and (box.dtype.kind == "u" or np.issubdtype(box.dtype, np.floating))
         if not (isinstance(box, spaces.Box) and axes and numbers):
@@ -48,17 +48,16 @@ class Pixels:
 
     @property
     def frame_shape(self) -> tuple[int, int]:
-        """Rows and columns."""
         return self.box.shape[self.axes[0]], self.box.shape[self.axes[1]]
 
     @property
     def channels(self) -> int:
-        """Colours and stacked images together."""
+        """The number of colours times that of stacked images."""
         return math.prod(self.box.shape) // math.prod(self.frame_shape)
 
     @property
     def scale(self) -> float:
-        """What pixels are multiplied with: integers become [0, 1], or what is asked for 0..255."""
+        """The factor for pixels. It brings integers to [0, 1], or any pixels to 0..255 if uint8 is asked for."""
         if self.box.dtype.kind == "u":
             whole = 256.0**self.box.dtype.itemsize - 1
         else:
@@ -73,19 +72,19 @@ class Pixels:
         return min(float(self.box.low.min()) * self.scale, 0.0), max(float(self.box.high.max()) * self.scale, 0.0)
 
     def frames(self, images: Num[np.ndarray, "B ..."]) -> Num[np.ndarray, "B H W C"]:
-        """A batch of images, channels last."""
+        """Reshapes a batch of images: channels last, stacked images among them."""
         images = images.transpose(0, *(axis + 1 for axis in self.axes))
         return images.reshape(len(images), *self.frame_shape, self.channels)
 
     def finish(self, image: np.ndarray) -> np.ndarray:
-        """A sensor's image in the range and the type that are asked for."""
+        """Brings a sensor's image to the range and the type that are asked for."""
         # A mean may round to just outside the range, and then would not be of the observation space.
         image = (image * np.float32(self.scale)).clip(*self.range)
         return (image.round() if self.dtype == np.uint8 else image).astype(self.dtype)
 
 
 def dtype_name(dtype: Any) -> str:
-    """The name of a type that images can have; `ConfigError` for another."""
+    """Returns the name of a type that images can have; raises `ConfigError` for another."""
     name = getattr(dtype, "__name__", str(dtype))
     if name not in ("float32", "uint8"):
         raise refuse("dtype", name, ("float32", "uint8"))
@@ -93,7 +92,7 @@ def dtype_name(dtype: Any) -> str:
 
 
 def _axes(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Rows, columns and then the other axes, stack before colours; none where it is no image."""
+    """Orders an image's axes: rows, columns, then a stack, then colours; empty for a shape that is no image."""
     if len(shape) == 2:
         axes: tuple[int, ...] = (0, 1)
     elif len(shape) == 3:

@@ -1,7 +1,7 @@
-"""The picture of what a sensor sees, as one table of indices.
+"""Draws what a sensor saw by looking its values up in tables of indices.
 
 Which value a pixel shows depends only on the pixel's place in the focal area or, outside of it, in the frame. So a
-recording needs to keep the values alone, and whoever draws them, in whatever language, needs two tables.
+recording keeps only the values, and any program can draw them with two tables.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Painting(NamedTuple):
 
 
 def tables(sensor: Sensor, frame_shape: tuple[int, int]) -> Painting:
-    """The tables of a packed sensor: the picture of images whose values are their own numbers."""
+    """Makes the tables of a packed sensor: its picture of images whose values are their own numbers."""
     images, count = [], 1  # 0 is what `picture` shows where nothing was seen
     for shape in sensor.image_shapes(frame_shape):
         size = int(np.prod(shape))
@@ -40,7 +40,7 @@ def tables(sensor: Sensor, frame_shape: tuple[int, int]) -> Painting:
 def paint(
     values: UInt8[np.ndarray, "n *C"], focal_point: Int[np.ndarray, "2"], painting: Painting
 ) -> UInt8[np.ndarray, "H W *C"]:
-    """The picture of one step's values; 0 where nothing is seen."""
+    """Draws one step's values; 0 where nothing is seen."""
     values = np.concatenate([values, np.zeros_like(values[:1])])  # what the index -1 finds
     image = values[painting.background]
     size = np.array(painting.window.shape)

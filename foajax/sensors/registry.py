@@ -1,4 +1,4 @@
-"""The sensor that a configuration asks for."""
+"""Makes the sensor that a configuration asks for."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from foajax.config.parse import refuse
 from foajax.config.parts import make_part
-from foajax.config.schema import OwnSensor, SensorConfig
+from foajax.config.schema import LogPolarSensor, OwnSensor, RingSensor, SensorConfig
 from foajax.sensors.base import Sensor
 from foajax.sensors.logpolar import LogPolar
 from foajax.sensors.rings import Rings
@@ -17,14 +17,19 @@ SENSORS = {"rings": Rings, "logpolar": LogPolar}  # by `sensor.kind`
 
 
 def make_sensor(sensor: SensorConfig | Sensor) -> Sensor:
-    """The sensor itself, the same one each time; one that is made already is given back.
+    """Returns the sensor of a configuration, the same object each time, or a `Sensor` as it is.
 
     Raises:
-      ConfigError: `sensor.kind` names code that cannot be found, takes other arguments or is no sensor.
+      ConfigError: `sensor` is neither; or `sensor.kind` names code that cannot be found, takes other arguments or is no
+        sensor.
     """
     if isinstance(sensor, OwnSensor):
         return _make_own(sensor.kind, json.dumps(sensor.kwargs, sort_keys=True))
-    return sensor if isinstance(sensor, Sensor) else _make(sensor)
+    if isinstance(sensor, RingSensor | LogPolarSensor):
+        return _make(sensor)
+    if not isinstance(sensor, Sensor):
+        raise refuse("sensor", sensor, "a RingSensor, LogPolarSensor or foajax.Sensor; in wrappers an experiment too")
+    return sensor
 
 
 @functools.cache
@@ -36,5 +41,5 @@ def _make(config: Any) -> Sensor:
 def _make_own(kind: str, kwargs: str) -> Sensor:
     made = make_part("sensor.kind", kind, {}, **json.loads(kwargs))
     if not isinstance(made, Sensor):
-        raise refuse("sensor.kind", kind, "a class that has all of foajax.sensors.base.Sensor")
+        raise refuse("sensor.kind", kind, "a class with all attributes of a foajax.Sensor")
     return made

@@ -47,7 +47,6 @@ class Rings(Sensor):
     def sense(
         self, frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str
     ) -> tuple[Float[Array, "_ _"], ...]:
-        """The canvas, or the rings' images and the grid's."""
         config, shape = self.config, (frame.shape[0], frame.shape[1])
         parts = look(frame, focal_point, bounds, size=self.window, pool=self._pool)
         cells = None if config.peripheral is None else sense_cells(frame, config)
@@ -63,13 +62,11 @@ class Rings(Sensor):
         return tuple(images)
 
     def image_shapes(self, frame_shape: Shape) -> tuple[Shape, ...]:
-        """The frame's, or the rings' in blocks and the grid's."""
         return (frame_shape,) if self.in_place else ring_shapes(self.config)
 
     def picture(
         self, images: tuple[Float[Array, "_ _"], ...], focal_point: Int[Array, "2"], frame_shape: Shape
     ) -> Float[Array, "H W"]:
-        """The canvas, of either layout."""
         if self.in_place:
             return images[0]
         corner, number = focal_point - np.array(self.window) // 2, len(self.config.rings)
@@ -77,7 +74,7 @@ class Rings(Sensor):
         return canvas(images[:number], cells, corner, self.config, frame_shape)
 
     def count(self, frame_shape: Shape) -> PixelCount:
-        """The pixel budget as Table II counts it, and what is really shown.
+        """Counts the pixel budget as Table II does, and the values really shown.
 
         Nominal: each ring's area less that of the next finer one, over its factor squared, rounded; a
         peripheral grid adds the largest number of cells that an area inside the frame leaves visible
@@ -88,21 +85,18 @@ class Rings(Sensor):
 
     @functools.cached_property
     def packed(self) -> Rings:
-        """The same rings in the packed layout."""
         return Rings(replace(self.config, layout="packed")) if self.in_place else self
 
     @property
     def in_place(self) -> bool:
-        """Whether the layout is a canvas."""
         return self.config.layout == "canvas"
 
     @property
     def areas(self) -> tuple[Shape, ...]:
-        """Of each ring."""
         return tuple(ring[:2] for ring in self.config.rings)
 
     def _pool(self, window: Num[Array, "h w"]) -> tuple[Float[Array, "_ _"], ...]:
-        """The mean of each block, ring by ring, nothing hidden yet; or its first pixel."""
+        """Returns each ring's blocks, before hiding: the mean of a block, or its first pixel."""
         parts, window = [], window.astype(jnp.float32)
         for (height, width, factor), (top, left) in zip(self.config.rings, offsets(self.config), strict=True):
             area = window[top : top + height, left : left + width]
@@ -117,9 +111,9 @@ class Rings(Sensor):
 
 
 def block_sums(x: Float[Array, "_ _"], factor: int, axis: int) -> Float[Array, "_ _"]:
-    """Sums over consecutive `factor` rows or columns; the last block may have fewer.
+    """Sums every `factor` consecutive rows or columns; the last block may have fewer.
 
-    Added up as strided slices: on a CPU many times faster than to reduce a reshaped axis.
+    Adding strided slices is many times faster on a CPU than reducing a reshaped axis.
     """
     size = x.shape[axis]
     whole = size - size % factor
@@ -132,7 +126,7 @@ def block_sums(x: Float[Array, "_ _"], factor: int, axis: int) -> Float[Array, "
 
 
 def sense_cells(frame: Num[Array, "H W"], sensor: RingSensor) -> Float[Array, "rows columns"]:
-    """The peripheral grid: the whole frame, coarse, nothing hidden yet."""
+    """Returns the peripheral grid, before hiding: the whole frame, coarse."""
     height, width = frame.shape
     rows, columns = cell_edges(sensor, (height, width))
     if sensor.pooling == "stride":
@@ -146,7 +140,7 @@ def sense_cells(frame: Num[Array, "H W"], sensor: RingSensor) -> Float[Array, "r
 
 
 def _averages(edges: np.ndarray) -> np.ndarray:
-    """A matrix [n, size] that takes the means over the n intervals between `edges`."""
+    """Returns a matrix [n, size] that takes the means over the n intervals between `edges`."""
     position = np.arange(edges[-1])
     inside = (position >= edges[:-1, None]) & (position < edges[1:, None])
     return (inside / np.diff(edges)[:, None]).astype(np.float32)
@@ -179,7 +173,7 @@ def canvas(
 
 
 def _repeat(x: Float[Array, "_ _"], counts: np.ndarray, axis: int) -> Float[Array, "_ _"]:
-    """Each row or column as often as `counts` says; equal counts need no gather."""
+    """Repeats each row or column as often as `counts` says; equal counts need no gather."""
     if (counts == counts[0]).all():
         return jnp.repeat(x, int(counts[0]), axis)
     return jnp.take(x, np.repeat(np.arange(len(counts)), counts), axis)

@@ -1,7 +1,7 @@
 """Turns one frame and a focal point into what a sensor sees, for every kind of sensor.
 
-It is for one frame; the caller vmaps and jits. The cost depends on the sensor, not on the frame, except
-where every pixel of the frame matters: a canvas, a peripheral grid of means.
+The caller vmaps and jits. The cost depends on the sensor, not on the frame, except where every pixel of the frame
+matters: for a canvas and a peripheral grid of means.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def sense(
     sensor: SensorConfig | Sensor,
     bounds: str = "point",
 ) -> tuple[Float[Array, "_ _ _"], ...]:
-    """What a sensor sees of one frame; arguments, results and errors are those of `foajax.sense`.
+    """Returns what a sensor sees of one frame; arguments, results and errors are those of `foajax.sense`.
 
     `sensor` and `bounds` are static.
     """
@@ -47,6 +47,6 @@ def picture(
     sensor: SensorConfig | Sensor,
     frame_shape: Shape,
 ) -> Float[Array, "H W C"]:
-    """What `sense` gave, put back in the frame's place; as `foajax.picture`."""
+    """Draws what `sense` returned at its place in the frame, as `foajax.picture` does."""
     gray = functools.partial(make_sensor(sensor).picture, focal_point=focal_point, frame_shape=frame_shape)
     return jax.vmap(gray, in_axes=2, out_axes=2)(images)

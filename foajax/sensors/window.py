@@ -1,4 +1,4 @@
-"""An area of a frame: cut out around the focal point, and put back in its place."""
+"""Cuts an area out of a frame around the focal point, and puts one back in its place."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Pool = Callable[[Num[Array, "h w"]], tuple[Float[Array, "_ _"], ...]]  # linear;
 def look(
     frame: Num[Array, "H W"], focal_point: Int[Array, "2"], bounds: str, *, size: Shape, pool: Pool
 ) -> tuple[Float[Array, "_ _"], ...]:
-    """What `pool` makes of the area of `size` around the focal point, 0 where it overhangs.
+    """Applies `pool` to the area of `size` around the focal point, 0 where it overhangs.
 
-    With bounds 'window' it never does, and this takes about two thirds of the time.
+    With bounds 'window' it never overhangs, which saves a third of the time.
     """
     corner = focal_point - np.array(size) // 2
     if bounds == "window":
@@ -31,9 +31,9 @@ def look(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def _look(frame: Num[Array, "H W"], corner: Int[Array, "2"], size: Shape, pool: Pool) -> tuple[Array, ...]:
-    """A slice, moved inside the frame, and a second look with care if it had to be moved.
+    """Pools a slice moved inside the frame, and pools again with zeros if it had to be moved.
 
-    That look is a loop of no or one turn, not a `lax.cond`: under vmap a cond runs both branches for all frames,
+    The second look is a loop of no or one turn, not a `lax.cond`: under vmap a cond runs both branches for all frames,
     a loop runs only if some area in the batch overhangs. Where none does, this is many times faster.
     """
     if any(length > limit for length, limit in zip(size, frame.shape, strict=True)):
@@ -66,10 +66,10 @@ def gather_window(image: Num[Array, "H W"], corner: Int[Array, "2"], size: Shape
 
 
 def apart(window: Num[Array, "h w"], corner: Int[Array, "2"]) -> Num[Array, "h w"]:
-    """The same window, worked out before it is used.
+    """Returns the same window, computed before it is used.
 
-    Fused into what uses it, a gather is three times slower, and XLA drops optimisation barriers
-    before it fuses. A loop that never turns keeps them apart.
+    XLA would fuse the gather into what uses it, which is three times slower, and drops optimisation barriers before
+    it fuses. A loop that never turns keeps them apart.
     """
     never = corner[0] == np.iinfo(corner.dtype).min
     return lax.while_loop(lambda state: state[0], lambda state: jax.tree.map(jnp.zeros_like, state), (never, window))[1]

@@ -1,9 +1,9 @@
-"""The sensors for other libraries: Gymnasium environments whose pixels are looked at through a gaze.
+"""Gymnasium wrappers, which show an environment's pixels through a sensor with a gaze.
 
 The order is that of training (`foajax.learning.agent`): a visual action moves the focal point before the frame that the
 step leads to is sensed, and a price of saccades (`gaze.cost`) is taken from the reward one step late.
 
-NumPy senses. JAX is imported for a user's own sensor only.
+NumPy senses. JAX is imported only for a user's own sensor.
 """
 
 from __future__ import annotations
@@ -183,14 +183,14 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
         return self._eye.look(observation), reward, terminated, truncated, info | self._facts()
 
     def _final(self, observations: Any, ended: np.ndarray) -> np.ndarray:
-        """The last observations of the episodes that ended, each as of one environment; None of the others."""
+        """Senses the last observations of the episodes that ended; None for the other environments."""
         seen = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended).tolist():
             seen[i] = self._eye.look_one(observations[i], i)
         return seen
 
     def _facts(self, which: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What the info dict has of the gazes, with Gymnasium's masks of who has it."""
+        """Returns the gazes' entries of the info dict, with Gymnasium's masks of which environments have them."""
         mask = np.ones(self.num_envs, bool) if which is None else which
         facts = self._eye.facts()
         return facts | {f"_{name}": mask.copy() for name in facts}
