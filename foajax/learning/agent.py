@@ -64,18 +64,18 @@ class Agent:
 
     @property
     def image_shapes(self) -> tuple[tuple[int, int, int], ...]:
-        """Of what the sensor gives of a frame, (h, w, 1) or, in colour, (h, w, 3) each."""
+        """The shapes of the sensor's images: (h, w, 1) or, in colour, (h, w, 3)."""
         env = self.config.env
         return tuple((*shape, math.prod(env.pixel_shape)) for shape in self.sensor.image_shapes(env.frame_shape))
 
     @property
     def screen_shape(self) -> tuple[int, ...]:
-        """Of what an environment shows: [H, W] or, in colour, [H, W, 3]."""
+        """The shape of the environment's screens: [H, W] or, in colour, [H, W, 3]."""
         env = self.config.env
         return (*(env.frame_shape if self.crop_top is None else SCREEN_SHAPE), *env.pixel_shape)
 
     def initial_params(self, key: PRNGKeyArray) -> Params:
-        """Parameters before any learning."""
+        """Draws the network's first parameters."""
         side = self.side(jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2), jnp.int32), jnp.zeros(1), jnp.zeros(1, bool))
         return networks.initial_params(self.network, key, self.image_shapes, side.shape[-1])
 
@@ -160,22 +160,22 @@ class Agent:
         return actor_output, output, state
 
     def unroll(self, params: Params, rollout: Rollout) -> NetworkOutput:
-        """The network over a whole rollout; each output [T+1, B, ...]."""
+        """Applies the network to a whole rollout; each output is [T+1, B, ...]."""
         steps = rollout.steps
         side = self.side(steps.focal_point, steps.last_actions, steps.reward, steps.is_first)
         return self.forward(params, list(steps.roi), side, steps.is_first, rollout.core_state)[0]
 
     def forward(self, params: Params, *inputs: Any) -> tuple[NetworkOutput, Carry]:
-        """The network over T steps; `inputs` are those of `networks.Network`."""
+        """Applies the network to T steps; `inputs` are those of `networks.Network`."""
         return cast(tuple[NetworkOutput, Carry], self.network.apply(params, *inputs))
 
     def see(
         self, screen: UInt8[HostArray, "B ..."], focal_point: Int[Array, "B 2"], statistics: FrameStatistics
     ) -> tuple[tuple[Array, ...], Float[Array, "B ..."], Float[Array, "B"]]:
-        """The sensor's images of normalised frames, and each frame's part in the running statistics.
+        """Returns the sensor's images of normalised frames, and each frame's part in the running statistics.
 
-        Without normalisation and crop only what the sensor looks at is read: then the cost of a decision does not
-        grow with the frame. (A peripheral grid of means looks at all of it.) There are no statistics then: zeros.
+        Without normalisation and crop it reads only what the sensor looks at: then the cost of a decision does not grow
+        with the frame. (A peripheral grid of means looks at all of it.) The statistics' parts are zeros then.
         """
         if self.config.network.normalization == "none" and self.crop_top is None:
             self.check(screen)
@@ -192,19 +192,19 @@ class Agent:
         return self.sense(normalised, focal_point), mean, std
 
     def frame(self, screen: UInt8[HostArray, "B ..."]) -> Float[Array, "B H W *C"]:
-        """Screens as frames in [0, 1]; `ValueError` for what is not as the agent was trained with."""
+        """Turns screens into frames in [0, 1]; raises `ValueError` as `check` does."""
         self.check(screen)
         return jax.vmap(lambda s: frames.to_frame(s, self.crop_top))(jnp.asarray(screen))
 
     def check(self, screen: UInt8[HostArray, "B ..."]) -> None:
-        """`ValueError` for screens that are not as the agent was trained with."""
+        """Raises `ValueError` unless screens have the type and shape that the agent was trained with."""
         shape = self.screen_shape
         if screen.dtype != jnp.uint8 or screen.shape[1:] != shape:
             accepted = f"uint8 [B, {', '.join(map(str, shape))}], {'RGB' if self.config.env.color else 'gray'}"
             raise refuse("frame", f"{screen.dtype} {list(screen.shape)}", accepted)
 
     def look(self, key: Key[Array, "B"], state: ActorState, timestep: TimeStep) -> tuple[Array, Array]:
-        """Focal points to sense this step at, and the actors' ages: both begin anew with an episode."""
+        """Returns this step's focal points and the actors' ages in steps. Both begin anew with an episode."""
         age = jnp.where(timestep.is_first, 0, state.age)
         if self.config.gaze.mode == "scripted":
             return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age), age
@@ -212,7 +212,7 @@ class Agent:
         return jnp.where(timestep.is_first[:, None], first, state.focal_point), age
 
     def move(self, focal_point: Int[Array, "B 2"], vision_action: Int[Array, "B"], age: Int[Array, "B"]) -> Array:
-        """Where the next frame is sensed."""
+        """Returns the focal points at which the next frames are sensed."""
         if self.config.gaze.mode == "scripted":
             return jax.vmap(lambda a: gaze.scripted(a, **self._gaze))(age)
         if self.config.gaze.mode in ("none", "frozen"):
@@ -220,11 +220,11 @@ class Agent:
         return jax.vmap(lambda p, a: gaze.move(p, a, **self._gaze))(focal_point, vision_action)
 
     def price(self, before: Int[Array, "B 2"], after: Int[Array, "B 2"]) -> Float[Array, "B"]:
-        """What the saccades from `before` to `after` cost, in units of reward."""
+        """Returns what the saccades from `before` to `after` cost, in units of reward."""
         return jax.vmap(functools.partial(gaze.price, gaze=self.config.gaze))(before, after)
 
     def choose_vision(self, key: Key[Array, "B"], output: NetworkOutput, greedy: bool) -> tuple[Array, Array]:
-        """Visual actions and their log-probabilities: learned, uniformly random, or 0 (stay)."""
+        """Returns visual actions, learned, random or 0 (stay), and their log-probabilities, 0 unless learned."""
         batch = output.natural_value.shape
         if output.vision_logits is not None:
             action = _choose(key, output.vision_logits, greedy)
@@ -235,7 +235,7 @@ class Agent:
         return jnp.zeros(batch, jnp.int32), jnp.zeros(batch)
 
     def sense(self, frame: Num[Array, "B H W *C"], focal_point: Int[Array, "B 2"]) -> tuple[Array, ...]:
-        """The sensor's images of each frame, [B, h, w, 1] or, in colour, [B, h, w, 3]."""
+        """Returns the sensor's images of each frame, [B, h, w, 1] or, in colour, [B, h, w, 3]."""
         look = functools.partial(sense, sensor=self.sensor, bounds=self.config.gaze.sense_bounds)
         return jax.vmap(look)(frame, focal_point)
 
@@ -246,10 +246,10 @@ class Agent:
         reward: Float[Array, "..."],
         is_first: Bool[Array, "..."],
     ) -> Float[Array, "... S"]:
-        """What the LSTM is told beside the images, as configured; S may be 0.
+        """Returns what the core is told beside the images, as configured; S may be 0.
 
-        The focal point; then, of the step before, the natural and the visual action as one-hot vectors and the reward
-        that is learned from, all 0 where an episode starts.
+        It is the focal point; then, of the step before, the natural and the visual action as one-hot vectors and the
+        reward that is learned from. Where an episode starts, these last three are 0.
         """
         parts = [jnp.zeros((*reward.shape, 0))]
         network = self.config.network
@@ -264,7 +264,7 @@ class Agent:
         return jnp.concatenate(parts, axis=-1)
 
     def _scaled(self, focal_point: Int[Array, "... 2"]) -> Float[Array, "... 2"]:
-        """Focal points in [-1, 1] of where they can be or, as older agents have them, of the frame."""
+        """Scales focal points to [-1, 1] over the gaze's reach or, with `network.focal_scale=frame`, over the frame."""
         if self.config.network.focal_scale == "frame":
             return gaze.to_unit(focal_point, self.config.env.frame_shape)
         return gaze.to_reach(focal_point, **self._gaze)
@@ -290,7 +290,7 @@ class Agent:
 def _pay(
     reward: Float[Array, "B"], owed: Float[Array, "B 2"] | None, is_first: Bool[Array, "B"]
 ) -> tuple[Float[Array, "B"], Float[Array, "B"] | None]:
-    """The reward less what is due now, and what is due next; what an episode leaves unpaid is forgiven."""
+    """Subtracts the due price from the reward; returns it and the price due next. A new episode owes nothing."""
     if owed is None:
         return reward, None
     owed = jnp.where(is_first[:, None], 0.0, owed)

@@ -1,7 +1,7 @@
 """The learner: both heads' losses on a minibatch of environments, and one optimiser step.
 
-Minibatches are applied one after another, as the asynchronous workers' gradients were: a synchronous batch
-would otherwise make `num_envs` times fewer updates a frame than the paper's threads.
+Each minibatch is a step of its own. One step per rollout would make `num_envs` times fewer updates per frame than the
+paper's asynchronous workers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Metrics = dict[str, Float[Array, "..."]]
 
 
 def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs, key: PRNGKeyArray) -> TrainState:
-    """State before the first update."""
+    """Returns the train state before the first update."""
     params = agent.initial_params(key)
     return TrainState(
         params=params,
@@ -37,10 +37,10 @@ def initial_state(agent: Agent, optimizer: optax.GradientTransformationExtraArgs
 
 
 def minibatch(rollout: Rollout, index: Int[Array, ""], size: int) -> Rollout:
-    """`size` environments of a rollout: every n-th column from `index` on, n = B / size.
+    """Selects `size` environments of a rollout: every n-th column from `index` on, n = B / size.
 
-    A slice of the rollout that holds a multiple of n environments thus has its share of every minibatch, and which
-    environments meet in one does not depend on how many devices share them. The frames' averages remain the rollout's.
+    So a device that holds a multiple of n environments has its share of every minibatch, and which environments meet in
+    one does not depend on how many devices share them. The frames' averages remain the rollout's.
     """
 
     def columns(x: Array, axis: int) -> Array:
@@ -57,7 +57,7 @@ def minibatch(rollout: Rollout, index: Int[Array, ""], size: int) -> Rollout:
 def loss(
     params: Params, agent: Agent, rollout: Rollout, *, axis: str | None = None
 ) -> tuple[Float[Array, ""], Metrics]:
-    """The paper's total loss (section "Dual-head Loss Function"): both heads' value and policy losses.
+    """Returns the paper's total loss (section "Dual-head Loss Function"): both heads' value and policy losses.
 
     With `axis`, the mesh axis that the environments are spread along, the results are a device's parts of the sums.
     """
@@ -108,7 +108,7 @@ class Targets(NamedTuple):
 
 
 def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, v: Array) -> Targets:
-    """Of one environment; every field is [T]."""
+    """Computes the natural head's targets for one environment; every field is [T]."""
     discount_t = head.gamma * (1.0 - is_terminal_t)
     return Targets(
         returns=returns.n_step_returns(r_t, discount_t, mask_t, v[1:]),
@@ -119,7 +119,7 @@ def _natural_targets(head: HeadConfig, r_t: Array, is_terminal_t: Array, mask_t:
 
 
 def _vision_targets(config: LearnerConfig, r_t: Array, is_terminal_t: Array, mask_t: Array, v: Array) -> Targets:
-    """Of one environment; every field is [T]."""
+    """Computes the vision head's targets for one environment; every field is [T]."""
     head = config.vision
     stream = (r_t, head.gamma * (1.0 - is_terminal_t), is_terminal_t, mask_t)
     credited = returns.vision_stream(r_t, is_terminal_t, mask_t, credits_last=config.credits_last_gaze)
@@ -143,7 +143,7 @@ def _head_loss(
     behaviour_log_prob: Float[Array, "T B"],
     axis: str | None,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """One head's policy, value and entropy terms; the only place where they are masked, reduced and weighted.
+    """Returns one head's loss and metrics. Only here are the terms masked, reduced and weighted.
 
     `valid` counts the steps that enter the policy's and the value's loss, on all devices.
     """
@@ -182,7 +182,7 @@ def _head_loss(
 
 
 def _whole(parts: Any, axis: str | None) -> Any:
-    """The sums of the devices' parts of a tree, in one exchange: its fixed cost is paid once, not for each array."""
+    """Sums the devices' parts of a tree in one exchange, whose fixed cost is then paid once, not for each array."""
     if not axis:
         return parts
     flat, restore = ravel_pytree(parts)
@@ -190,12 +190,12 @@ def _whole(parts: Any, axis: str | None) -> Any:
 
 
 def _summed_up(metrics: Metrics) -> Metrics:
-    """What only the whole minibatch's means tell, in the place of those means.
+    """Replaces the means that were only parts of a metric of the whole minibatch.
 
-    `information`, of each head's mean `policy`: what its decisions tell of what was seen, in nats. The entropy of the
-    mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
+    Each head's mean `policy` gives `information`: what its decisions tell of what was seen, in nats. It is the entropy
+    of the mean policy less the mean entropy of the policies: 0 where an agent acts alike whatever it sees.
 
-    `target_variance` and `error_variance`, of the `moments`: see `explained_variance`.
+    The `moments` give `target_variance` and `error_variance`: see `explained_variance`.
     """
     kept = dict(metrics)
     # In the mapping's order: in a set's, which no two processes share, they would compile different programs.
@@ -208,9 +208,9 @@ def _summed_up(metrics: Metrics) -> Metrics:
 
 
 def explained_variance(means: dict[str, float]) -> dict[str, float]:
-    """Updates' mean metrics with each head's 1 - Var(target - value) / Var(target), 1 at best, for both variances.
+    """Replaces each head's two variances by 1 - Var(target - value) / Var(target), which is 1 at best.
 
-    Of the means, because a minibatch without any reward has targets that hardly differ.
+    It takes their means over updates, because a minibatch without any reward has targets that hardly differ.
     """
     kept = dict(means)
     for head in [name.removesuffix("_error_variance") for name in means if name.endswith("_error_variance")]:
@@ -222,7 +222,7 @@ def explained_variance(means: dict[str, float]) -> dict[str, float]:
 def observe(state: TrainState, rollout: Rollout, *, axis: str | None = None) -> TrainState:
     """Takes a rollout's frames into the running statistics and learns nothing.
 
-    The deviation begins anew: what was measured from means that were not known yet is forgotten.
+    The deviation begins anew, because the earlier ones were measured from means that were not known yet.
     """
     averages, count = _frame_averages(rollout, axis)
     frame_mean, frame_std = _whole(averages, axis)
@@ -231,7 +231,7 @@ def observe(state: TrainState, rollout: Rollout, *, axis: str | None = None) -> 
 
 
 def _frame_averages(rollout: Rollout, axis: str | None) -> tuple[tuple[Array, Array], int]:
-    """A device's part of the mean and the deviation of a rollout's frames, and how many these are on all devices."""
+    """Returns a device's part of a rollout's mean frame and deviation, and the number of frames on all devices."""
     shards = jax.lax.axis_size(axis) if axis else 1
     mean, std = (jnp.mean(x[:-1], (0, 1)) / shards for x in rollout.steps.frames)
     return (mean, std), rollout.steps.is_first[:-1].size * shards
@@ -248,12 +248,11 @@ def update(
     *,
     axis: str | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """One optimiser step on minibatch `index` of a rollout.
+    """Makes one optimiser step on minibatch `index` of a rollout.
 
-    Where the loss or the gradient is not finite, parameters and optimiser stay as they were and the step is counted
-    as skipped. So it is where a new parameter is not, but there the optimiser's averages go on: they have seen a
-    finite gradient, and a step of theirs that is too large gets smaller. Frames enter the running statistics on the
-    first pass over a rollout only.
+    If the loss or the gradient is not finite, parameters and optimiser stay as they were and the step is counted as
+    skipped. If only a new parameter is not finite, it is skipped too, but the optimiser's averages go on: they saw a
+    finite gradient, and later steps get smaller. Frames enter the running statistics on the first pass only.
 
     With `axis`, a mesh axis, `rollout` is a device's share and `size` its share of a minibatch; the state and the
     metrics are those of the whole, the same on every device.

@@ -1,4 +1,4 @@
-"""The terms of the loss, one number a step: [T, B], neither masked nor weighted.
+"""The terms of the loss, one number per step: [T, B], neither masked nor weighted.
 
 The same functions serve the natural and the vision head. Masking, reduction (`reduce_steps`) and weights are
 the learner's, in one place. Advantages, targets and the behaviour's log-probabilities are constants: no
@@ -70,11 +70,11 @@ def reduce_steps(
     steps: Int[Array, ""] | None = None,
     shards: int = 1,
 ) -> Float[Array, ""]:
-    """One number from a term of the loss, over the steps where `mask_t` is not 0.
+    """Reduces a term of the loss to one number, over the steps where `mask_t` is not 0.
 
     `mean` is the mean over all these steps (0 where there is none); `sum` adds them up over time, as the
-    paper does, and takes the mean over the B environments. What `x` holds elsewhere does not matter to
-    the number, NaN included; a gradient of its own there has to be finite.
+    paper does, and takes the mean over the B environments. Elsewhere `x` may hold anything, even NaN, as
+    long as its own gradient there is finite.
 
     Where the environments are spread over `shards`, of B each, with `steps` valid steps in all (`valid_steps`), the
     result is one shard's part: the parts add up to the number.
@@ -86,5 +86,5 @@ def reduce_steps(
 
 
 def valid_steps(mask_t: Float[Array, "T B"]) -> Int[Array, ""]:
-    """How many steps enter the loss."""
+    """Counts the steps that enter the loss."""
     return jnp.sum(mask_t > 0)

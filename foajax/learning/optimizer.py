@@ -21,7 +21,7 @@ from foajax.types import Params
 
 
 class AdamState(NamedTuple):
-    """What the optimiser remembers: the same tree for every configuration, and for checkpoints of any age."""
+    """The optimiser's state. Its tree is the same for every configuration and in checkpoints of any age."""
 
     count: Int[Array, ""]  # type: ignore[assignment]  # updates made; hides tuple.count
     mu: Params  # moving average of the gradient
@@ -30,12 +30,12 @@ class AdamState(NamedTuple):
 
 
 def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.GradientTransformationExtraArgs:
-    """The optimiser of a run: clipping by global norm, Adam (Kingma & Ba 2015) or AMSGrad (Reddi et al. 2018), rate.
+    """Makes a run's optimiser: clipping by global norm; Adam (Kingma & Ba 2015) or AMSGrad (Reddi et al. 2018); rate.
 
     The rate of update n = 1, 2, .. is `learning_rate`, times min(1, n / warmup_updates), times
     max(0, 1 - (n - 1) / total_updates) where `schedule` is `linear`. With `full_rate_inputs`, the update of a layer's
-    weights is multiplied by min(1, full_rate_inputs / inputs): a step of one size in every weight moves a unit the
-    further, the more inputs it has (Yang et al. 2022, table 3).
+    weights is multiplied by min(1, full_rate_inputs / inputs): the more inputs a unit has, the further it is moved by
+    a step of one size in every weight (Yang et al. 2022, table 3).
 
     `update` takes one argument more than Optax's: with `accept=False` the gradient, whatever it holds, changes
     nothing and the update is 0.
@@ -72,7 +72,7 @@ def make_optimizer(learner: LearnerConfig, total_updates: int) -> optax.Gradient
 
 
 def _rate(learner: LearnerConfig, total_updates: int, count: Int[Array, ""]) -> Array | float:
-    """The learning rate after `count` updates."""
+    """Returns the learning rate after `count` updates."""
     rate: Array | float = learner.learning_rate
     if learner.warmup_updates:
         rate *= jnp.minimum((count + 1) / learner.warmup_updates, 1.0)

@@ -19,7 +19,7 @@ from foajax.types import ActorState, Rollout, TimeStep, TrainState
 
 
 class Programs(NamedTuple):
-    """Compiled once each; every call is one dispatch."""
+    """The compiled programs; each call is one dispatch."""
 
     act: Callable[..., tuple[Array, ActorState, Rollout]]
     update: Callable[..., tuple[TrainState, learner.Metrics]]
@@ -28,10 +28,10 @@ class Programs(NamedTuple):
 
 
 def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
-    """`act` records a decision in the rollout's buffer (donated); `update` applies one minibatch (state donated);
-    `observe` takes a rollout's frames into the statistics (state donated).
+    """Compiles the programs; with a `layout`, to run on each device's share of the environments.
 
-    With a `layout` they are the same programs on each device's share of the environments.
+    `act` records a decision in the rollout's buffer (donated); `update` applies one minibatch (state donated);
+    `observe` takes a rollout's frames into the statistics (state donated).
     """
     config = agent.config
     optimizer = make_optimizer(config.learner, total_updates(agent))
@@ -57,7 +57,7 @@ def make_programs(agent: Agent, layout: Layout | None = None) -> Programs:
 
 
 def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, *, donate: int) -> Callable:
-    """`program` on each device of a mesh, compiled; arrays from the host go to the devices that need them."""
+    """Compiles `program` for each device of a mesh. Arrays from the host go to the devices that need them."""
     spread = jax.shard_map(program, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
     shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), inputs)
     compiled = jax.jit(spread, in_shardings=shardings, donate_argnums=donate)
@@ -68,23 +68,23 @@ def _on(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, *, donate: i
 
 
 def total_updates(agent: Agent) -> int:
-    """Minibatch updates until `train.env_steps`, for the learning-rate schedule."""
+    """Counts the minibatch updates until `train.env_steps`, for the learning-rate schedule."""
     config = agent.config
     rollouts = -(-config.train.env_steps // (config.env.num_envs * config.learner.rollout_length))
     return rollouts * config.learner.num_minibatches * config.learner.num_epochs
 
 
 def make_state(agent: Agent, seed: int) -> TrainState:
-    """The train state at the start of a run."""
+    """Makes the train state at the start of a run."""
     optimizer = make_optimizer(agent.config.learner, total_updates(agent))
     make = jax.jit(functools.partial(learner.initial_state, agent, optimizer))
     return make(jax.random.fold_in(jax.random.key(seed), 0))
 
 
 def acting_keys(seed: int, group: int, first: int, batch: int) -> Key[Array, "B"]:
-    """Keys of a group's actors `first` .. `first + batch - 1`.
+    """Returns the keys of a group's actors `first` .. `first + batch - 1`.
 
-    Each step folds its own number in, so that resuming needs only the count; a key an actor, so that an actor
+    Each step folds its own number in, so that resuming needs only the count. Each actor has its own key, so that it
     samples the same wherever the others are.
     """
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 1), group)
@@ -92,7 +92,7 @@ def acting_keys(seed: int, group: int, first: int, batch: int) -> Key[Array, "B"
 
 
 def empty_rollout(agent: Agent, batch: int, timestep: TimeStep, shards: int = 1) -> Rollout:
-    """The buffer that `act` writes to: T+1 rows of `batch` environments, spread over `shards` devices."""
+    """Makes the buffer that `act` writes to: T+1 rows of `batch` environments, spread over `shards` devices."""
     actor_state = agent.initial_state(batch)
     shapes = jax.eval_shape(
         lambda: agent.act(

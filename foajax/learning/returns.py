@@ -155,7 +155,7 @@ def vision_advantages(
 
 
 def _accumulate(a: Float[Array, " T"], b: Float[Array, " T"]) -> Float[Array, " T"]:
-    """x_i = a[i] + b[i] * x_{i+1} for i = T-1 .. 0, with x_T = 0."""
+    """Computes x_i = a[i] + b[i] * x_{i+1} for i = T-1 .. 0, with x_T = 0."""
 
     def step(x, row):
         x = row[0] + row[1] * x

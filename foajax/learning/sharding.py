@@ -26,7 +26,7 @@ ROLLOUT: Any = Rollout(steps=cast(Any, PartitionSpec(None, DATA)), core_state=ca
 class Layout:
     """The devices of all processes, in the order of the environments, and those of this one.
 
-    Acting needs no other process: its arrays lie on `local`. The update's lie on `job`. Turning one into the other
+    Acting needs no other process: its arrays lie on `local`. The update's lie on `job`. Changing from one to the other
     copies nothing: the pieces stay where they are.
     """
 
@@ -35,16 +35,16 @@ class Layout:
         self.local = Mesh(np.array(local), (DATA,))
 
     def replicate(self, tree: Any) -> Any:
-        """Host arrays, the same in every process, on all devices."""
+        """Copies host arrays, the same in every process, to all devices."""
         place = NamedSharding(self.job, EVERYWHERE)
         return jax.tree.map(lambda x: jax.make_array_from_process_local_data(place, np.asarray(x), np.shape(x)), tree)
 
     def nearby(self, tree: Any) -> Any:
-        """What lies on all devices, as arrays on this process's alone."""
+        """Returns replicated arrays as arrays on this process's devices alone."""
         return jax.tree.map(lambda x: self._regroup(x, self.local, EVERYWHERE, x.shape), tree)
 
     def join(self, rollout: Rollout) -> Rollout:
-        """The processes' rollouts as one."""
+        """Joins the processes' rollouts into one."""
         return Rollout(
             steps=jax.tree.map(lambda x: self._join(x, ROLLOUT.steps), rollout.steps),
             core_state=jax.tree.map(lambda x: self._join(x, ROLLOUT.core_state), rollout.core_state),

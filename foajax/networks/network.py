@@ -40,7 +40,7 @@ class Network(nn.Module):
         is_first: Bool[Array, "T B"],
         core_state: Carry,
     ) -> tuple[NetworkOutput, Carry]:
-        """`side` is what the core is told beside the images, S numbers or none. Each output is [T, B, ...]."""
+        """Returns outputs [T, B, ...] and the last state. `side` holds what the core is told beside the images."""
         steps, batch = is_first.shape
         features = self.features([image.reshape(steps * batch, *image.shape[2:]) for image in roi])
         features = jnp.concatenate([features, side.reshape(steps * batch, side.shape[-1])], axis=-1)
@@ -60,7 +60,7 @@ class Network(nn.Module):
         return output, core_state
 
     def features(self, images: Sequence[Float[Array, "N _ _ _"]]) -> Float[Array, "N F"]:
-        """What the torso makes of the sensor's images, concatenated; then the dense layer if there is one."""
+        """Concatenates the torso's features of all images, then applies the dense layer if there is one."""
         parts = [
             make_torso(self.config, name=f"torso_{i}")(x)
             if min(x.shape[1:3]) >= smallest_image(self.config.torso)
@@ -76,9 +76,9 @@ class Network(nn.Module):
         return features
 
     def priority(self, cells: Float[Array, "T B h w C"], hidden: Float[Array, "T B L"]) -> Float[Array, "T B V"]:
-        """What each cell of the peripheral grid adds to the logit of looking there: how well it matches a query.
+        """Returns what each cell of the peripheral grid adds to the logit of looking there: its match with a query.
 
-        The query comes from the memory and is the same for all cells, and so are the weights that read a cell and
+        The query comes from the core's output and is the same for all cells, as are the weights that read a cell and
         its neighbours. So what makes a place worth a look is learned once, not once for each place.
         """
         steps, batch = hidden.shape[:2]
@@ -88,24 +88,24 @@ class Network(nn.Module):
         return jnp.einsum("tbvk,tbk->tbv", keys, query) / math.sqrt(_MAP)
 
     def head(self, name: str, hidden: Float[Array, "T B L"], actions: int) -> tuple[Array, Array]:
-        """Softmax logits and value. Small first logits: every action is about equally likely at the start."""
+        """Returns logits and value of a head. First logits are small: all actions are about equally likely."""
         logits = nn.Dense(actions, kernel_init=nn.initializers.orthogonal(0.01), name=f"{name}_policy")(hidden)
         value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name=f"{name}_value")(hidden)
         return logits, value[..., 0]
 
 
 def smallest_image(torso: str) -> int:
-    """The sides that an image has at least for `torso` to see it; a smaller one goes straight to the next layer."""
+    """Returns the smallest side of an image that `torso` reads. A smaller image goes straight to the next layer."""
     return 12 if torso == "small" else 8
 
 
 def initial_params(network: Network, key: Array, image_shapes: Sequence[tuple[int, int, int]], side: int) -> Params:
-    """Parameters for images of these shapes (h, w, channels), and `side` numbers beside them."""
+    """Draws parameters for images of these shapes (h, w, channels), and `side` numbers beside them."""
     roi = [jnp.zeros((1, 1, *shape)) for shape in image_shapes]
     core_state = initial_core_state(network, 1)
     return network.init(key, roi, jnp.zeros((1, 1, side)), jnp.zeros((1, 1), bool), core_state)
 
 
 def initial_core_state(network: Network, batch: int) -> Carry:
-    """Before the first step of `batch` environments."""
+    """Returns the core's state before the first step of `batch` environments."""
     return make_core(network.config).initial_state(batch)

@@ -18,7 +18,7 @@ RELU_GAIN = math.sqrt(2.0)  # keeps the variance through a ReLU (He et al. 2015)
 
 
 def convolution(features: int, kernel: tuple[int, int], stride: int = 1, **more: Any) -> nn.Conv:
-    """A valid convolution with a bias."""
+    """Makes a convolution with a bias and, unless `more` says otherwise, no padding."""
     init = nn.initializers.orthogonal(RELU_GAIN)
     return nn.Conv(features, kernel, (stride, stride), **{"padding": "VALID", "kernel_init": init, **more})
 
@@ -120,7 +120,7 @@ TORSOS = {"nature": NatureTorso, "a3c": A3CTorso, "small": SmallTorso, "impala":
 
 
 def make_torso(config: NetworkConfig, name: str | None = None) -> nn.Module:
-    """The torso of one image.
+    """Makes the torso that `network.torso` names, for one image.
 
     Raises:
       ConfigError: `network.torso` names code that cannot be found, takes other arguments or is no Flax module; or
