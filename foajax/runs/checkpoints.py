@@ -7,10 +7,10 @@ A checkpoint is a directory named after its ``env_steps``:
     1200/SHA256SUMS  checksums of all the files above; `sha256sum -c SHA256SUMS` checks it by hand
 
 It is written under another name, synced and renamed, so a numbered directory is always complete. Orbax
-stores the arrays; what processes share is the same in all of them, so one of them writes it. Its CheckpointManager is
-not used: it has no place for checksums inside its atomic step, leaves the half-written directory of a
-failed save behind, and on a full disk prints hundreds of lines from its own threads. Nothing here reads
-pickles or any other format that can carry code.
+stores the arrays. Processes that share a run have the same state, so one of them writes it. Orbax's
+CheckpointManager is not used: it has no place for checksums inside its atomic step, leaves the half-written
+directory of a failed save behind, and on a full disk prints hundreds of lines from its own threads. Nothing
+here reads pickles or any other format that can carry code.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _to_stderr(text: str) -> None:
 class Checkpoints:
     """The checkpoints of one run. One process may write; any number may read meanwhile.
 
-    A writer is used in a `with`, or waited for, before the process ends, or its last write may be lost.
+    Use a writer in a `with`, or call `wait` before the process ends: else its last write may be lost.
 
     Args:
       directory: where they are; created by the first save.
@@ -140,7 +140,7 @@ class Checkpoints:
         self.wait()
 
     def restore(self, template: Any, *, part: bool = False, best: bool = False) -> Restored | None:
-        """The newest usable checkpoint, to go on from; None where there is none at all.
+        """Reads the newest usable checkpoint, to go on from; None where there is none at all.
 
         Each one is verified against its checksums and against `template` (a pytree of arrays or
         `jax.ShapeDtypeStruct`; names, shapes and dtypes must agree) before it is used. One that fails is
@@ -175,7 +175,7 @@ class Checkpoints:
         return _score(self.directory / str(step)), step
 
     def _run(self, keep: int, env_steps: int, arrays: dict[str, Any], text: str) -> None:
-        """The writing thread."""
+        """Writes a checkpoint and deletes old ones, on the writing thread."""
         new = self.directory / f".{env_steps}.new"
         try:
             self._write(env_steps, new, arrays, text)
@@ -222,7 +222,7 @@ class Checkpoints:
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """Leaves by their path, e.g. `0/params/dense/kernel`."""
+    """Returns the leaves by their path, e.g. `0/params/dense/kernel`."""
     paths = jax.tree_util.tree_leaves_with_path(tree)
     named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}
     if len(named) != len(paths):
@@ -239,7 +239,7 @@ def _describe(leaf: Any) -> str:
 
 
 def _copy(leaf: Any) -> Any:
-    """A copy that shares no memory, on the same device and not waited for; keys as their raw data.
+    """Copies an array on its device, without waiting and sharing no memory; a key becomes its raw data.
 
     `may_alias=False` copies without compiling anything, which `jnp.copy` would do once for each shape.
     """
@@ -250,9 +250,9 @@ def _copy(leaf: Any) -> Any:
 
 @contextlib.contextmanager
 def _orbax() -> Iterator[ocp.Checkpointer]:
-    """Orbax for this process alone: it would otherwise wait for all that share a run, of which one keeps the files.
+    """Yields Orbax for this process alone. It would otherwise wait for all processes of a run, of which one writes.
 
-    What its options leave open: arrays of the host are written by process 0 only, whoever the primary host is.
+    Its options leave one thing open: only process 0 writes arrays of the host, whoever the primary host is.
     """
     alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0})
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
@@ -264,7 +264,7 @@ def _orbax() -> Iterator[ocp.Checkpointer]:
 
 
 def _claim(path: Path, size: int) -> None:
-    """Takes `size` bytes of the disk and gives them back; OSError where it has no room for them.
+    """Fills `size` bytes of the disk and frees them; raises OSError if there is no room.
 
     Orbax would notice too, with pages of tracebacks and writes that go on after the error.
     """
@@ -275,12 +275,12 @@ def _claim(path: Path, size: int) -> None:
 
 
 def _read(path: Path, template: Any, *, part: bool) -> Restored:
-    """A verified checkpoint; CheckpointError for whatever may be wrong with it."""
+    """Reads and verifies a checkpoint; raises CheckpointError for whatever may be wrong with it."""
     try:
         durable.verify(path)
         body = json.loads((path / "meta.json").read_text(encoding="utf-8"))
         if body.get("format") != _FORMAT:
-            raise CheckpointError(f"its format is {body.get('format')}, this version reads {_FORMAT}")
+            raise CheckpointError(f"its format is {body.get('format')}, this foajax reads {_FORMAT}")
         if str(body["env_steps"]) != path.name or not isinstance(body["meta"], dict):
             raise CheckpointError("meta.json belongs to another checkpoint")
         leaves = named_leaves(template)
@@ -295,14 +295,14 @@ def _read(path: Path, template: Any, *, part: bool) -> Restored:
 
 
 def _read_arrays(path: Path, names: list[str]) -> dict[str, np.ndarray]:
-    """All arrays by name, on the host whatever devices they came from."""
+    """Reads all arrays by name to the host, whatever devices they came from."""
     host = ocp.RestoreArgs(restore_type=np.ndarray)
     with _orbax() as orbax:
         return orbax.restore(path, args=ocp.args.PyTreeRestore(restore_args=dict.fromkeys(names, host)))
 
 
 def _place(arrays: Mapping[str, np.ndarray], leaves: Mapping[str, Any]) -> dict[str, Any]:
-    """The arrays that `leaves` asks for, as they are there: host or device, raw or key."""
+    """Puts the arrays that `leaves` asks for where `leaves` are: on the host or a device, raw or as keys."""
     placed = {}
     for name, leaf in leaves.items():
         array = arrays[name]
@@ -332,7 +332,7 @@ def _set_aside(path: Path) -> None:
 
 
 def _score(path: Path) -> float:
-    """A checkpoint's score; -inf where there is none or it cannot be read."""
+    """Reads a checkpoint's score; -inf where there is none or it cannot be read."""
     try:
         score = float(json.loads((path / "meta.json").read_text(encoding="utf-8"))["meta"]["score"])
     except Exception:  # an unreadable checkpoint is never the best; `restore` is what reports it

@@ -1,9 +1,9 @@
-"""A run's directory: one process at a time holds it, and its configuration keeps its meaning.
+"""A run's directory: one process at a time holds it, and no later start changes what the run learns.
 
     config.yaml   the resolved configuration
     run.json      every start: command, versions, commit, machine, devices, time
-    lock          locked by the process that trains; names it
-    failure.txt   why the last start failed, where it did
+    lock          locked by the process that trains; the text names it
+    failure.txt   why the last start failed, if it did
 
 Further files belong to others: ``metrics.jsonl`` (logger), ``checkpoints/`` (checkpoints).
 """
@@ -29,7 +29,7 @@ from foajax.runs.provenance import RECORD, record_start
 PARAMETERS = "agent.safetensors"  # of a shipped agent, which is no run
 _CONFIG = "config.yaml"
 _FAILURE = "failure.txt"
-# Keys that runs have not always had, and what was done before: older runs are read as they were made.
+# Keys that older runs lack, with the values that act as these runs did.
 _BEFORE = {
     "network": {
         **{"lstm_norm": False, "padding": "valid", "focal_point": "packed", "focal_scale": "frame"},
@@ -108,7 +108,7 @@ def open_run(config: Config, *, command: Sequence[str], devices: Sequence[str] =
 
 
 def take_over(path: Path) -> RunDir | None:
-    """Holds the directory of a run that nobody holds any more; None where somebody does or it cannot be seen."""
+    """Holds the directory of a run that no process holds any more; returns None if one does or there is no run."""
     try:
         return RunDir(path, take_lock(path)) if is_run(path) else None
     except RunError:
@@ -116,7 +116,7 @@ def take_over(path: Path) -> RunDir | None:
 
 
 def load_config(path: str | os.PathLike[str], *, key: str = "run", accepted: str = "the directory of a run") -> Config:
-    """The configuration of the run in `path`, with ``run`` set to `path`.
+    """Reads the configuration of the run in `path`, with ``run`` set to `path`.
 
     Args:
       path: its directory.
@@ -145,9 +145,8 @@ def load_config(path: str | os.PathLike[str], *, key: str = "run", accepted: str
     except OSError as error:
         raise refuse(str(file), accepted="", why=f"cannot be read ({reason_of(error)})", kind=RunError) from None
     except Exception as error:  # a file of any content ends up here
-        raise refuse(
-            str(file), accepted="", why=f"is not the configuration of a run ({reason_of(error)})", kind=RunError
-        ) from None
+        why = f"is not the configuration of a run ({reason_of(error)})"
+        raise refuse(str(file), accepted="", why=why, kind=RunError) from None
     return replace(config, run=str(path))
 
 
@@ -157,19 +156,19 @@ def is_run(path: Path) -> bool:
 
 
 def note_failure(path: Path, why: str) -> None:
-    """Keeps why this start of the run in `path` failed."""
+    """Writes to ``failure.txt`` why this start of the run in `path` failed."""
     with contextlib.suppress(OSError):
         (path / _FAILURE).write_text(why + "\n", encoding="utf-8")
 
 
 def forget_failure(path: Path) -> None:
-    """The run in `path` is started again: what it failed of before is past."""
+    """Deletes ``failure.txt``, because the run in `path` is started again."""
     with contextlib.suppress(OSError):
         (path / _FAILURE).unlink(missing_ok=True)
 
 
 def failure(path: Path) -> str | None:
-    """Why the last start of the run in `path` failed, in one line; None where it did not."""
+    """Reads why the last start of the run in `path` failed, in one line; None where it did not."""
     try:
         return (path / _FAILURE).read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
@@ -177,18 +176,18 @@ def failure(path: Path) -> str | None:
 
 
 def describe_error(error: Exception) -> str:
-    """An error in one line: the text of what the user can mend, else its type as well."""
+    """Describes an error in one line: its text and, unless the user can mend it, its type."""
     text = one_line(error)
     return text if isinstance(error, ConfigError) else f"{type(error).__name__}: {text}"
 
 
 def compared(config: Config) -> dict[str, Any]:
-    """A run's dotted keys and their values, but for its logger's, which may always change."""
+    """Returns a run's values by dotted key, without those of its logger, which may always change."""
     return {key: value for key, value in flatten(to_mapping(config)) if not key.startswith("train.logger")}
 
 
 def _settle_config(path: Path, config: Config) -> None:
-    """Writes ``config.yaml`` if it is new or differs in ways that may; RunError if in others."""
+    """Writes ``config.yaml`` if it is new or differs only as it may (`FREE`); else raises RunError."""
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
     file = path / _CONFIG
     if os.path.lexists(file):
@@ -199,9 +198,9 @@ def _settle_config(path: Path, config: Config) -> None:
 
 
 def check_same_run(path: Path, config: Config) -> None:
-    """RunError where the run in `path` differs from `config` in a key that changes what is learned.
+    """Raises RunError if the run in `path` differs from `config` in a key that changes what is learned.
 
-    Where nothing was learned yet, because the run was refused, it may differ: the next words correct the last ones.
+    A run without a row or a checkpoint may differ: it has learned nothing, so the new words replace the old ones.
     """
     stored, asked = compared(load_config(path)), compared(config)
     if not _has_begun(path):
@@ -220,7 +219,7 @@ def check_same_run(path: Path, config: Config) -> None:
 
 
 def _has_begun(path: Path) -> bool:
-    """Whether a row or a checkpoint is there."""
+    """Whether the run has a row of metrics or a checkpoint."""
     rows, checkpoints = path / "metrics.jsonl", path / "checkpoints"
     return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
 

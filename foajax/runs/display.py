@@ -1,4 +1,4 @@
-"""A run on the terminal: all metrics drawn in place on one, a short line at a time elsewhere."""
+"""Shows a run on the terminal: all metrics drawn in place or, where it is no terminal, a short line per row."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Display:
             self._live.update(Group(Text(progress), bar, _grid(values)), refresh=True)
 
     def message(self, text: str) -> None:
-        """A line that stays; may come from any thread."""
+        """Prints a line that stays; may be called from any thread."""
         with contextlib.suppress(OSError):
             if self._live is None:
                 print(text, flush=True)
@@ -86,7 +86,7 @@ def _number(value: int | float | None) -> str:
 
 
 def _grid(values: Mapping[str, str]) -> Table:
-    """Names and numbers in a few columns, filled row by row."""
+    """Lays names and numbers out in a few columns, row by row."""
     grid = Table.grid(padding=(0, 2))
     cells = [[Text(name, style="dim"), Text(value, justify="right")] for name, value in values.items()]
     for i in range(0, len(cells), _COLUMNS):

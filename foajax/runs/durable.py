@@ -1,8 +1,8 @@
 """Files that are whole or not there: atomic replacement, and directories sealed with checksums.
 
-`seal` writes ``SHA256SUMS`` beside the files, one line a file in the format of the `sha256sum` program
-(`sha256sum -c SHA256SUMS` checks it by hand). `verify` accepts exactly the sealed content: a changed,
-missing or additional file, and a damaged ``SHA256SUMS`` itself, are found and named.
+`seal` writes ``SHA256SUMS`` beside the files, one line per file in the format of the `sha256sum` program
+(`sha256sum -c SHA256SUMS` checks it by hand). `verify` finds and names what differs from the sealed content: a
+changed, missing or additional file, or a damaged ``SHA256SUMS`` itself.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class DamageError(Exception):
 
 
 def replace(path: Path, content: bytes) -> None:
-    """Writes a file so that a reader, or whoever comes after a crash, finds the old content or the new."""
+    """Writes a file so that a reader, also one after a crash, finds the old content or the new."""
     new = path.with_name(f".{path.name}.new")
     try:
         new.write_bytes(content)
@@ -68,7 +68,7 @@ def verify(directory: Path) -> None:
 
 
 def _checksums(directory: Path) -> str:
-    """The text of ``SHA256SUMS`` for the files as they are; DamageError for links, pipes and devices."""
+    """Returns the text of ``SHA256SUMS`` for the files as they are; DamageError for links, pipes and devices."""
     lines = []
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
@@ -81,7 +81,7 @@ def _checksums(directory: Path) -> str:
 
 
 def _parse(text: str) -> dict[str, str]:
-    """Digest by name."""
+    """Returns the digests by file name."""
     pairs = (line.partition("  ") for line in text.splitlines())
     return {name: digest for digest, _, name in pairs if name}
 

@@ -16,7 +16,7 @@ class RunError(ConfigError):
 
 
 def refuse_run(path: Path, why: str, accepted: str = "") -> ConfigError:
-    """The error, to be raised, about a run's directory."""
+    """Makes the error about a run's directory. The caller raises it."""
     return refuse("run", path, accepted, why=why, kind=RunError)
 
 
@@ -33,7 +33,7 @@ def is_held(path: Path) -> bool:
 
 
 def take_lock(path: Path) -> int:
-    """Locks the directory until the descriptor that is returned is closed; RunError where another process has it."""
+    """Locks the directory until the returned descriptor is closed; raises RunError if another process has it."""
     try:
         lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
@@ -53,7 +53,7 @@ def take_lock(path: Path) -> int:
 
 
 def _lock(descriptor: int) -> None:
-    """The kernel's lock; BlockingIOError where another process has it for longer than a look (`is_held`) takes."""
+    """Takes the kernel's lock. Waits as long as a look (`is_held`) may take, then raises BlockingIOError."""
     for wait in (0.01, 0.05, 0.2, None):
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -65,5 +65,5 @@ def _lock(descriptor: int) -> None:
 
 
 def reason_of(error: Exception) -> str:
-    """Why a file cannot be used, for the end of a line."""
+    """Returns why a file cannot be used, for the end of a line."""
     return brief(getattr(error, "strerror", None) or error)

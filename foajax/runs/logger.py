@@ -1,11 +1,11 @@
-"""What a run says while it trains: ``metrics.jsonl``, TensorBoard, the terminal, and what `train.logger` names.
+"""The outputs of a run that trains: ``metrics.jsonl``, TensorBoard, the terminal, and what `train.logger` names.
 
-``metrics.jsonl`` in the run directory is the source of truth, one JSON object a row:
+``metrics.jsonl`` in the run directory is the source of truth, one JSON object per row:
 
     {"env_steps": 64000, "time": 51.2, "score": 1.5, ...}
 
 ``time`` is seconds of training over all starts of the run, without the work that a resumed run repeats.
-What is not finite becomes null, so that every row is valid JSON. No output that fails ends a run.
+Numbers that are not finite become null, so that every row is valid JSON. An output that fails does not end the run.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Logger:
                 self._other = other()
 
     def write(self, row: Mapping[str, SupportsFloat]) -> None:
-        """One row of scalars; ``env_steps`` is required, ``time`` is added unless it is there."""
+        """Writes a row of scalars; ``env_steps`` is required, ``time`` is added unless it is there."""
         env_steps, seconds = int(float(row["env_steps"])), round(time.monotonic() + self._seconds, 3)
         scalars = {name: _plain(value) for name, value in row.items()}
         record = {"env_steps": env_steps, "time": seconds} | scalars | {"env_steps": env_steps}
@@ -92,16 +92,16 @@ class Logger:
                 self._other.log(finite, env_steps)
 
     def image(self, tag: str, array: UInt8[np.ndarray, "H W *C"]) -> None:
-        """An image, gray or in colour, 0..255, for TensorBoard; belongs to the last row's ``env_steps``."""
+        """Writes an image, gray or in colour, 0..255, to TensorBoard, at the last row's ``env_steps``."""
         with self._survive("tensorboard"):
             self._events.image(tag, array, self._env_steps)
 
     def message(self, text: str) -> None:
-        """A line for the reader of the terminal; may come from any thread."""
+        """Prints a line on the terminal; may be called from any thread."""
         self._display.message(text)
 
     def close(self) -> None:
-        """Ends the display and the files."""
+        """Closes the display and the files."""
         for output, close in (("metrics.jsonl", self._metrics.close), ("tensorboard", self._events.close)):
             with self._survive(output):
                 close()
@@ -118,7 +118,7 @@ class Logger:
 
     @contextlib.contextmanager
     def _survive(self, output: str) -> Iterator[None]:
-        """Turns an error into a message, at most one a minute for each output."""
+        """Turns an error into a warning, at most one per minute for each output."""
         try:
             yield
         except Exception as error:
@@ -131,7 +131,7 @@ class Logger:
 
 
 def _plain(value: SupportsFloat) -> int | float | None:
-    """A number that JSON has."""
+    """Converts a number to one that JSON has; None if it is not finite."""
     if isinstance(value, Integral):
         return int(value)
     number = float(value)
@@ -139,7 +139,7 @@ def _plain(value: SupportsFloat) -> int | float | None:
 
 
 class _MetricsFile:
-    """Rows that could not be written are kept and come first the next time."""
+    """The file ``metrics.jsonl``. Rows that could not be written are kept and come first the next time."""
 
     def __init__(self, path: Path, start_env_steps: int) -> None:
         self.seconds = _trim(path, start_env_steps)  # of training up to the last row
@@ -162,7 +162,7 @@ class _MetricsFile:
 
 
 def _trim(path: Path, start_env_steps: int) -> float:
-    """Removes rows beyond `start_env_steps` and what is no row; the last row's ``time`` is returned.
+    """Removes rows beyond `start_env_steps` and torn ones; returns the ``time`` of the last row that stays.
 
     Where nothing stays (a run whose checkpoints are gone starts anew), the rows are kept as ``metrics.old.jsonl``.
     """

@@ -1,4 +1,4 @@
-"""``run.json`` records with what command, code and machine each start of a run was made."""
+"""Records in ``run.json`` with what command, code and machine each start of a run was made."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _describe_start(command: Sequence[str], devices: Sequence[str]) -> dict[str,
 
 
 def machine() -> dict[str, Any]:
-    """What decides how fast a program runs here, and how it rounds."""
+    """Describes what decides how fast a program runs here, and how it rounds."""
     return {
         "python": platform.python_version(),
         "packages": {name: version(name) for name in _PACKAGES},
@@ -57,7 +57,7 @@ def machine() -> dict[str, Any]:
 
 
 def version(package: str) -> str | None:
-    """Of an installed package; None where it is not there."""
+    """Returns the version of an installed package; None if it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -65,7 +65,7 @@ def version(package: str) -> str | None:
 
 
 def commit() -> str | None:
-    """The commit of the checkout this package runs from, with "-dirty" after changes; None elsewhere."""
+    """Returns the commit of this package's checkout, with "-dirty" after changes; None outside of a checkout."""
     package = Path(__file__).resolve().parents[1]
     # An installed package may lie inside the checkout of something else.
     if not (package.parent / ".git").exists():
@@ -79,7 +79,7 @@ def commit() -> str | None:
 
 
 def last_commit(path: Path) -> str | None:
-    """The commit that the run in `path` was last started with; None of anything else."""
+    """Returns the commit that the run in `path` was last started with; None if it is unknown."""
     try:
         return json.loads((path / RECORD).read_text(encoding="utf-8"))["starts"][-1]["commit"]
     except (OSError, ValueError, LookupError, TypeError):
@@ -87,7 +87,7 @@ def last_commit(path: Path) -> str | None:
 
 
 def _cpu() -> str:
-    """The processor's model where the system says it, else its architecture."""
+    """Returns the processor's model where the system tells it, else its architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     except OSError:

@@ -13,7 +13,7 @@ SPEED_ROWS = 10  # rows that the shown speed is averaged over
 
 
 def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
-    """A row of ``metrics.jsonl`` with finite ``env_steps``, ``time`` and `more`; None where it is torn or none."""
+    """Parses a row of ``metrics.jsonl`` with finite ``env_steps``, ``time`` and `more`; None for any other line."""
     try:
         row = json.loads(line)
         return row if all(math.isfinite(row[key]) for key in ("env_steps", "time", *more)) else None
@@ -22,7 +22,7 @@ def parse_row(line: bytes, *more: str) -> dict[str, Any] | None:
 
 
 def last_rows(path: Path) -> list[dict[str, Any]]:
-    """The newest rows of metrics, oldest first; a torn one is left out."""
+    """Reads the newest rows of metrics, oldest first, without torn ones."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
@@ -33,7 +33,7 @@ def last_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def speed_of(rows: list[dict[str, Any]]) -> float | None:
-    """Env_steps a second over the newest rows; None where they do not tell."""
+    """Returns env_steps per second over the newest rows; None if they cover no time."""
     rows = rows[-SPEED_ROWS - 1 :]
     seconds = rows[-1]["time"] - rows[0]["time"] if rows else 0.0
     return (rows[-1]["env_steps"] - rows[0]["env_steps"]) / seconds if seconds > 0 else None

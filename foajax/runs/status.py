@@ -1,4 +1,4 @@
-"""What a run is doing, as its files tell it."""
+"""Finds runs, and tells from its files what a run is doing."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ class RunStatus(NamedTuple):
 
     @property
     def seconds_left(self) -> float | None:
-        """Until the end at the speed of late; None where nothing moves."""
+        """Seconds until the end at the speed of late; None unless it is running."""
         if self.state != "running" or not self.speed:
             return None
         return max(self.total - self.env_steps, 0) / self.speed
 
 
 def newest_checkpoint(path: Path) -> int:
-    """`env_steps` of the newest checkpoint of the run in `path`; 0 where there is none."""
+    """Returns `env_steps` of the newest checkpoint of the run in `path`; 0 where there is none."""
     with contextlib.suppress(OSError):
         return max((int(name) for name in os.listdir(path / "checkpoints") if name.isdecimal()), default=0)
     return 0
 
 
 def is_finished(config: Config) -> bool:
-    """Whether `config`'s run has been trained to its end already, and means the same as what is asked for."""
+    """Whether the run of `config` has been trained to its end, by a configuration that learns the same."""
     path = Path(config.run_dir)
     if newest_checkpoint(path) < config.train.env_steps:
         return False
@@ -59,13 +59,11 @@ def is_finished(config: Config) -> bool:
 
 
 def find_runs(directories: Sequence[str | os.PathLike[str]]) -> list[Path]:
-    """The runs in and below `directories`, each once, sorted; `ConfigError` where one is no directory."""
+    """Finds the runs in and below `directories`, each once, sorted; `ConfigError` where one is no directory."""
     found: set[Path] = set()
     for directory in directories:
         if not os.path.isdir(directory):
-            raise refuse(
-                str(directory), accepted="a directory with runs, as foajax train writes them", why="is no directory"
-            )
+            raise refuse(str(directory), accepted="a directory with runs", why="is no directory")
         for parent, below, _ in os.walk(directory):
             if is_run(Path(parent)):
                 found.add(Path(parent))
@@ -74,7 +72,7 @@ def find_runs(directories: Sequence[str | os.PathLike[str]]) -> list[Path]:
 
 
 def inspect(path: Path) -> RunStatus:
-    """The run in `path`, as its files tell it."""
+    """Reads the status of the run in `path` from its files."""
     try:
         stored = _stored(path, os.stat(path / "config.yaml").st_mtime_ns)
     except (ConfigError, OSError) as error:
@@ -103,7 +101,7 @@ def _state(path: Path, has_rows: bool, finished: bool, patience: float) -> tuple
 
 @functools.lru_cache(maxsize=10_000)
 def _stored(path: Path, changed: int) -> Config:
-    """A run's configuration, read again when the file's time changes."""
+    """Reads a run's configuration, once for each time at which the file was changed."""
     return load_config(path)
 
 

@@ -1,4 +1,4 @@
-"""TensorBoard's files, written without a thread."""
+"""Writes TensorBoard's files, without a thread."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from foajax.runs.durable import WholeFile
 class EventFile:
     """TensorBoard's file of one start, opened by the first event; what cannot be written is left out.
 
-    tensorboardX encodes. Its writer is not used: that has a thread, which a full disk ends, and a queue of
-    ten events, which then blocks the caller for good.
+    tensorboardX encodes. Its own writer is not used: a full disk ends its thread, and then its queue of ten events
+    blocks the caller for good.
     """
 
     def __init__(self, directory: Path, start_env_steps: int) -> None:
@@ -62,7 +62,7 @@ class EventFile:
 
 
 def _record(event: dict[str, Any]) -> bytes:
-    """An event as TensorBoard's files have it: length, its checksum, content, its checksum."""
+    """Encodes an event as TensorBoard's files have it: length, its checksum, content, its checksum."""
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.record_writer import masked_crc32c
 
