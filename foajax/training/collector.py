@@ -25,7 +25,7 @@ from foajax.types import ActorState, Outcome, Rollout, TimeStep, TrainState
 def update_on(
     rollouts: Sequence[Rollout], state: TrainState, programs: Programs, learner: LearnerConfig
 ) -> tuple[TrainState, list[Metrics]]:
-    """All minibatches of the groups' rollouts, `epochs` times, one after another; nothing is waited for."""
+    """Updates on all minibatches of the groups' rollouts, `num_epochs` times, without waiting for the device."""
     metrics = []
     for epoch in range(learner.num_epochs):
         for rollout in rollouts:
@@ -41,7 +41,7 @@ ROLLOUTS_TO_OBSERVE = 2
 
 
 class Group(NamedTuple):
-    """One group's place in the game, between two rollouts."""
+    """What one group takes from one rollout to the next."""
 
     timestep: TimeStep  # to be acted on next
     actor_state: ActorState
@@ -49,7 +49,7 @@ class Group(NamedTuple):
 
 
 class Collector:
-    """Steps all groups through T steps and hands out their rollouts.
+    """Steps all groups through T steps and returns their rollouts.
 
     Where several processes share a run, `part` is this one's number: its environments are that part of each group.
     """
@@ -75,7 +75,7 @@ class Collector:
             )
 
     def collect(self, state: TrainState, first_step: int) -> tuple[list[Rollout], list[list[Outcome]]]:
-        """One rollout of each group, and its outcomes step by step.
+        """Collects one rollout of each group, and its outcomes step by step.
 
         `first_step` counts the steps that each environment has made, from below 0 where a run first observes; it
         seeds the sampling.
@@ -98,7 +98,7 @@ class Collector:
         return [group.rollout for group in self.groups], outcomes
 
     def decide(self, state: TrainState, first_step: int) -> None:
-        """A rollout's decisions, waited for, without the environments: what acting costs. It spoils the rows."""
+        """Makes a rollout's decisions without the environments and waits for them, to time acting. Spoils the rows."""
         acting = (state.params, state.statistics)
         for row in range(self._length):
             for i in range(len(self.groups)):
@@ -107,7 +107,7 @@ class Collector:
                 jax.block_until_ready(action)
 
     def measures(self) -> dict[str, float]:
-        """What this process's last episodes tell beside their scores, by name; empty for most games."""
+        """Returns measures of this process's last episodes beside their scores, by name; empty for most games."""
         return summarise(pooled([tracker.table() for tracker in self._facts]))
 
     @property
@@ -116,7 +116,7 @@ class Collector:
         return all(hasattr(environment, "get_state") for environment in self._environments)
 
     def get_state(self) -> list[dict[str, Any]]:
-        """What it takes to go on bit for bit, a group each; empty where the environments cannot be saved."""
+        """Returns each group's state, to go on bit for bit; empty where the environments cannot be saved."""
         if not self.resumable:
             return []
         return [
@@ -125,7 +125,7 @@ class Collector:
         ]
 
     def set_state(self, state: Sequence[dict[str, Any]]) -> None:
-        """Goes on from what `get_state` gave."""
+        """Goes on from what `get_state` returned."""
         for i, saved in enumerate(state):
             timestep, _ = self._environments[i].set_state(saved["environment"])
             # On the host: how many devices share them may have changed.

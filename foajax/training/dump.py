@@ -1,4 +1,4 @@
-"""`train.dump_skipped=true`: the batches whose updates were not finite, for whoever looks for the cause.
+"""Writes the batches whose updates were not finite (`train.dump_skipped=true`), to look for the cause.
 
     skipped/64000-3.safetensors   the rollout of one group that began at 64000 env_steps, and the parameters that
                                   acted in it; the metadata say which minibatch of it was skipped
@@ -20,7 +20,7 @@ from foajax.runs import durable
 from foajax.runs.agents import named
 from foajax.types import Params, Rollout
 
-_MOST = 5  # files a start of a run: a disk is not to be filled with one mistake
+_MOST = 5  # files per start of a run: one mistake must not fill a disk
 
 
 class Dump:
@@ -41,16 +41,16 @@ class Dump:
         self._kept: tuple[Params, Sequence[Rollout]] = (None, ())
 
     def remember(self, env_steps: int, params: Params, rollouts: Sequence[Rollout]) -> None:
-        """Copies what the updates that come next are made of, before they and the next rollout overwrite it."""
+        """Copies parameters and rollouts, before the next updates and the next rollout overwrite them."""
         if self._left:
             self._env_steps = env_steps
             self._kept = jax.tree.map(lambda x: jax.device_put(x, may_alias=False), (params, tuple(rollouts)))
 
     def look(self, metrics: Sequence[dict[str, Any]]) -> None:
-        """Writes what was remembered, if one of its updates was the first of a row to be skipped.
+        """Writes the remembered rollouts whose update was skipped, of skipped ones in a row only the first.
 
         Args:
-          metrics: of all its updates, in order: passes, groups, minibatches.
+          metrics: of all updates on them, in order: passes, groups, minibatches.
         """
         if not self._left:
             return
@@ -72,4 +72,4 @@ class Dump:
         except OSError as error:
             self._warn(f"{path} was not written: {error.strerror}")
             return
-        self._warn(f"an update was not finite and skipped: its batch is in {path}")
+        self._warn(f"skipped an update that was not finite; its batch is in {path}")

@@ -42,16 +42,16 @@ class EpisodeTracker:
 
     @property
     def mean_score(self) -> float:
-        """Of the last finished games; NaN before the first."""
+        """The mean score of the last finished games; NaN before the first."""
         return float(np.mean([score for score, _ in self._recent])) if self._recent else math.nan
 
     @property
     def mean_length(self) -> float:
-        """Of the last finished games, agent steps; NaN before the first."""
+        """The mean length of the last finished games, agent steps; NaN before the first."""
         return float(np.mean([length for _, length in self._recent])) if self._recent else math.nan
 
     def get_state(self) -> dict[str, Any]:
-        """All of it, as JSON has it."""
+        """Returns all of it, as JSON has it."""
         return {
             "games": self.games,
             "best_score": None if math.isnan(self.best_score) else self.best_score,

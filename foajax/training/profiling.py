@@ -1,4 +1,4 @@
-"""`profile=true`: where the time of a few steady rollouts goes, as a trace and as a table."""
+"""Shows where the time of a few steady rollouts goes (`profile=true`), as a trace and as a table."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Stopwatch:
         self.calls: dict[str, int] = defaultdict(int)
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """`function`, timed as `part`."""
+        """Wraps `function` so that its time counts as `part`."""
 
         def run(*arguments: Any) -> Any:
             begin = time.perf_counter()
@@ -75,9 +75,9 @@ def profile(config: Config, environments: list[Environment], directory: str) -> 
 
 
 def flops_a_step(agent: Agent) -> dict[str, float]:
-    """Floating-point operations of `act` and of `update` (without the optimiser) for one step, as XLA counts them.
+    """Counts floating-point operations of `act` and `update` (without the optimiser) for one step, as XLA does.
 
-    Counted on few images and scaled up.
+    It compiles few images and scales up.
     """
     false = np.zeros(1, bool)
     timestep = TimeStep(np.zeros((1, *agent.screen_shape), np.uint8), np.zeros(1, np.float32), false, false)
@@ -98,7 +98,7 @@ def flops_a_step(agent: Agent) -> dict[str, float]:
 
 
 def matrix_product_rate() -> float:
-    """Floating-point operations a second of a large float32 matrix product: what the processor can do."""
+    """Measures floating-point operations per second of a large float32 matrix product."""
     side = 2048
     x, product = jnp.ones((side, side)), jax.jit(jnp.dot)
     product(x, x).block_until_ready()
@@ -111,7 +111,7 @@ def _print(config: Config, stopwatch: Stopwatch, total: float, flops: Mapping[st
     env_steps = _ROLLOUTS * config.learner.rollout_length * config.env.num_envs
     rate = matrix_product_rate()
     title = f"{config.name} on {config.game}, {jax.devices()[0]}"
-    table = Table("part", "share", "us a step", "calls", "MFLOP a step", "GFLOP/s", "floor us", title=title)
+    table = Table("part", "share", "us/step", "calls", "MFLOP/step", "GFLOP/s", "floor us", title=title)
     parts = {part: stopwatch.seconds[part] for part in ("env", "act", "update")}
     for part, seconds in (parts | {"host": total - sum(parts.values())}).items():
         calls = str(stopwatch.calls[part]) if part in stopwatch.calls else ""
@@ -123,5 +123,5 @@ def _print(config: Config, stopwatch: Stopwatch, total: float, flops: Mapping[st
     table.add_row("all", "100 %", f"{1e6 * total / env_steps:.1f}", end_section=True)
     console = Console(width=100)
     console.print(table)
-    console.print(f"{env_steps / total:.0f} steps/s with every part waited for; training overlaps them and is faster")
-    console.print(f"floor: the arithmetic at {rate / 1e9:.0f} GFLOP/s, which a large matrix product reaches here")
+    console.print(f"{env_steps / total:.0f} steps/s with parts one by one; training overlaps them and is faster")
+    console.print(f"floor us: the arithmetic at {rate / 1e9:.0f} GFLOP/s, as fast as a large matrix product")

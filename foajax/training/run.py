@@ -36,9 +36,9 @@ _PICTURES_EVERY = 900.0  # seconds
 
 
 class Run:
-    """One run's parts, at the point where its newest checkpoint left it.
+    """The parts of one run, at the point where its newest checkpoint left it.
 
-    Processes that share a run all act and learn; the first of them has the directory, and alone writes and speaks.
+    Processes that share a run all act and learn. Only the first has the directory, writes and prints.
     """
 
     def __init__(self, config: Config, job: Job, run_dir: RunDir | None, resources: contextlib.ExitStack) -> None:
@@ -61,8 +61,7 @@ class Run:
         self._dump = self._open(run_dir, resources)
 
     def _make_environments(self, resources: contextlib.ExitStack) -> list[Environment]:
-        """This process's, watched. Emulators cannot be saved: a resumed run plays new episodes, seeded by how far it
-        got."""
+        """Makes this process's environments, watched. A resumed run has other seeds: emulators cannot be saved."""
         watchdog = Watchdog(
             self._config.env.timeout,
             abandon=self._abandon,
@@ -78,7 +77,7 @@ class Run:
         return environments
 
     def _first_state(self) -> TrainState:
-        """Before any learning, or with another agent's parameters; on all devices."""
+        """Makes the first state, with the parameters of `train.init_from` if that is set, on all devices."""
         config, job = self._config, self._job
         state = make_state(self._agent, config.seed)
         if (path := config.train.init_from) is not None and not self.progress.env_steps:
@@ -87,7 +86,7 @@ class Run:
         return self._layout.replicate(state) if self._layout else state
 
     def _open(self, run_dir: RunDir | None, resources: contextlib.ExitStack) -> Dump | None:
-        """Opens the files that the run writes, and says how it starts; returns where to keep skipped batches."""
+        """Opens the files that the run writes, and says how it starts; returns what keeps skipped batches, or None."""
         config, env_steps = self._config, self.progress.env_steps
         if run_dir is None or self._saving.checkpoints is None:
             self._journal.write_to(None)
@@ -103,7 +102,7 @@ class Run:
         return Dump(run_dir.path / "skipped", minibatches=config.learner.num_minibatches, warn=self._journal.warn)
 
     def loop(self, stop: StopRequest) -> None:
-        """Rollouts and updates until `train.env_steps` or a request to stop; saves in the end, whatever ends it."""
+        """Collects and updates until `train.env_steps` or a request to stop; saves in the end, whatever ends it."""
         try:
             with self._watch.expecting_others():
                 self._loop(stop)
@@ -156,18 +155,18 @@ class Run:
             self._log(metrics)
 
     def _is_to_stop(self, stop: StopRequest) -> bool:
-        """Several processes stop after the same rollout, or the others would wait for the one that does not come."""
+        """Whether to stop. Several processes stop after the same rollout, because each waits for the others in it."""
         return stop.name is not None if self._job.count == 1 else self._stop_agreed
 
     def _step(self) -> int:
-        """How many steps each environment has made, below 0 while a run observes; seeds what is sampled."""
+        """Returns how many steps each environment has made, below 0 while a run observes; it seeds the sampling."""
         observing = self._to_observe * self._config.learner.rollout_length
         return self.progress.env_steps // self._config.env.num_envs - observing
 
     def _exchange(
         self, outcomes: list[list[Outcome]], stop: StopRequest
     ) -> tuple[list[list[Outcome]], list[dict[str, Any]]]:
-        """What all processes have to know of each other after a rollout: all outcomes, and the games as they stand."""
+        """Gathers what processes tell each other after a rollout: their outcomes, games and requests to stop."""
         games = self._collector.get_state()
         if self._job.count == 1:
             return outcomes, games
@@ -183,14 +182,14 @@ class Run:
             self.progress.tracker.add(Outcome(*(np.concatenate(field) for field in zip(*step, strict=True))))
 
     def _nearby(self, state: TrainState) -> TrainState:
-        """What acting needs of the state, on this process's devices."""
+        """Returns the state with what acting needs of it on this process's devices."""
         if self._layout is None:
             return state
         params, statistics = self._layout.nearby((state.params, state.statistics))
         return state._replace(params=params, statistics=statistics)
 
     def _check(self, metrics: list[Metrics]) -> None:
-        """Stops a run whose updates are not finite time after time."""
+        """Raises `ConfigError` if too many updates in a row were not finite; dumps skipped batches if asked to."""
         if not metrics:
             return
         if self._dump:
@@ -206,7 +205,7 @@ class Run:
         self._journal.row(self.progress.env_steps, metrics, self.progress.tracker, measures, self._agent.num_actions)
 
     def _abandon(self, why: str, code: int) -> int:
-        """The watchdog's last words, and the exit code: the main thread does not come back."""
+        """Saves and reports in place of the main thread, which does not come back; returns the exit code."""
         self._saving.finish(self.progress)
         if code:
             report_fault(self._config, why, None)
@@ -229,7 +228,7 @@ class Run:
         return f"resumed at {self.progress.env_steps:,} env_steps ({games})"
 
     def _unsaved(self) -> str:
-        reason = f"it stands at {self.progress.env_steps:,} env_steps, of which {self._saving.newest():,} are saved"
+        reason = f"it was trained to {self.progress.env_steps:,} env_steps, but {self._saving.newest():,} are saved"
         return str(refuse("run", self._config.run_dir, "a directory that can be written", why=reason))
 
     def _how_it_ends(self, stop: str | None) -> str:

@@ -1,4 +1,4 @@
-"""Where a run stands, what a checkpoint holds of it, and how it goes on from there."""
+"""Saves where a run stands, and takes it up from a checkpoint."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Saving:
         return max(self.checkpoints.steps(), default=0) if self.checkpoints is not None else 0
 
     def is_saved(self, progress: Progress) -> bool:
-        """Whether there is nothing to lose."""
+        """Whether nothing is left to save."""
         return self.checkpoints is None or progress.env_steps in (0, *self.checkpoints.steps())
 
     def save(self, progress: Progress) -> None:
@@ -67,7 +67,7 @@ class Saving:
             self.checkpoints.save(*self._snapshot(progress))
 
     def finish(self, progress: Progress) -> None:
-        """Saves what the last update left, before the process ends, and waits for it."""
+        """Saves what the last update left and waits for it, before the process ends."""
         if progress.games is None or self.checkpoints is None or not progress.env_steps:
             return  # before the first rollout is through there is nothing to keep
         try:
@@ -95,13 +95,13 @@ class Saving:
         progress.env_steps, progress.games = env_steps, arrays["collector"]
 
     def refresh_copy(self, progress: Progress) -> None:
-        """Of several processes: copies now and then what is to be saved should one of them be lost."""
+        """Copies the state now and then, for `rescue` to save if one of several processes is lost."""
         now, every = time.monotonic(), self._config.distributed.timeout / 20
         if self._copy is None or now - self._copied >= every:
             self._copy, self._copied = self._snapshot(progress), now
 
     def rescue(self) -> str:
-        """Writes that copy, from any thread, if no other process does; returns where it leaves the run."""
+        """Writes that copy, from any thread, unless another process does; returns what to tell the user."""
         if self.checkpoints is None and (run_dir := take_over(Path(self._config.run_dir))):
             self.checkpoints = self._open(run_dir)
         if self.checkpoints is None:
@@ -117,7 +117,7 @@ class Saving:
         return Checkpoints(run_dir.path / CHECKPOINTS, keep=self._config.train.keep_checkpoints, warn=self._warn)
 
     def _snapshot(self, progress: Progress) -> tuple[int, dict[str, Any], dict[str, Any]]:
-        """A checkpoint's env_steps, arrays and the rest."""
+        """Returns what `Checkpoints.save` takes: env_steps, arrays and meta."""
         tracker = progress.tracker
         meta: dict[str, Any] = {"tracker": tracker.get_state()}
         if tracker.games >= _GAMES_FOR_A_SCORE:

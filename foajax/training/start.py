@@ -25,7 +25,7 @@ from foajax.training.run import Run
 
 
 def check(config: Config) -> None:
-    """Finds mistakes that a configuration does not show by itself; of a sweep, in all runs before the first one.
+    """Finds mistakes that a configuration does not show by itself. A sweep checks all runs before the first one.
 
     Raises:
       ConfigError: no gaze and a focal area that is not the whole frame; no such game, torso, core or
@@ -34,8 +34,8 @@ def check(config: Config) -> None:
     window, frame = make_sensor(config.sensor).window, config.env.frame_shape
     check_window(config, window)
     if config.gaze.mode == "none" and window != frame:
-        sizes = f"as large as the frame, {frame[0]}x{frame[1]}, not {window[0]}x{window[1]}"
-        raise refuse("gaze.mode", "none", f"a focal area {sizes}; or learned, frozen, random, scripted")
+        why = f"the focal area is {window[0]}x{window[1]}, not the whole frame, {frame[0]}x{frame[1]}"
+        raise refuse("gaze.mode", "none", "learned, frozen, random or scripted", why=why)
     check_game(config)
     find_logger(config)
     make_torso(config.network)
@@ -91,7 +91,7 @@ def train_agent(config: Config) -> TrainedAgent:
       config: what `foajax.compose` returns.
 
     Raises:
-      ConfigError: there is no such run, or the directory belongs to another run.
+      ConfigError: the configuration cannot be run, or the directory belongs to another run.
       EnvironmentFault: an environment raised; what was learned is saved.
     """
     use_compilation_cache()

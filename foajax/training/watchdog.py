@@ -1,12 +1,12 @@
 """Ends a run whose environments raise or hang, and one that is asked to stop while it is blocked.
 
 A call that never returns holds the main thread for good, and no signal handler of Python runs there. So a
-thread of its own watches: it knows which call of an environment the main thread is in, and hears of signals
-through the descriptor that the interpreter writes their numbers to. What it takes over it ends: the state is
-saved from here and the process exits, as nothing else would end a call that does not return.
+thread of its own watches. It knows which call of an environment the main thread is in, and hears of signals
+through the descriptor that the interpreter writes their numbers to. If it takes over, it saves the state and
+exits the process, as nothing else would end a call that does not return.
 
-What it cannot help against is an engine that hangs while it holds the interpreter's lock, or crashes the
-process: that costs the time since the last checkpoint.
+It cannot help if an engine hangs while it holds the interpreter's lock, or crashes the process. That costs
+the time since the last checkpoint.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class EnvironmentFault(Exception):
 
 
 class Call(NamedTuple):
-    """What the main thread waits for; told from the same call later by its identity."""
+    """A call that the main thread waits for. Its identity tells it from a later one of the same method."""
 
     what: str
     timeout: float  # seconds
@@ -57,11 +57,11 @@ class Watchdog:
       timeout: seconds that one call of an environment may take. Only seconds in which this process runs count:
         one that was stopped, or a machine that slept, is not taken for hung.
       abandon: called on the watching thread before the process exits, with what happened (the name of a signal,
-        or a line about the call) and the exit code, which it may change by what it returns; the main thread does
+        or a line about the call) and the exit code; it returns the code to exit with. The main thread does
         nothing more then, and what it had before the call is whole.
-      is_saved: whether there is nothing to lose.
-      alone: whether it ends a process that does not answer a request to stop. One of several that stop together
-        has to wait for them: its end would break what they are in.
+      is_saved: whether nothing is left to save.
+      alone: whether to end a process that does not answer a request to stop. Not for several that share a run:
+        they stop together, and the end of one would break what the others are in.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Watchdog:
         self.close()
 
     def watched(self, what: str, function: Callable[..., Any], *, patience: float = 1.0) -> Callable[..., Any]:
-        """`function`, of an environment: may raise `EnvironmentFault`, may hang; gets `patience` times the timeout."""
+        """Wraps an environment's function: errors become `EnvironmentFault`; it has `patience` timeouts to return."""
 
         @functools.wraps(function)
         def call(*arguments: Any) -> Any:
@@ -123,7 +123,7 @@ class Watchdog:
         return call
 
     def watch(self, environment: Any, name: str) -> None:
-        """Watches what the host calls of an environment from now on."""
+        """Watches the calls of an environment from now on."""
         for method in _METHODS:
             setattr(environment, method, self.watched(f"{name}: {method}", getattr(environment, method)))
 
@@ -146,7 +146,7 @@ class Watchdog:
                 self._take_over(call, asked, 0)
 
     def _take_over(self, call: Call | None, why: str, code: int) -> None:
-        """Saves and exits, unless the main thread is past `call` by now or at work outside of any."""
+        """Saves and exits, unless `call` has returned, or the main thread is in no call and has something to save."""
         with self._lock:
             if self._call is not call or (call is None and not self._is_saved()) or self._closed:
                 return
@@ -159,7 +159,7 @@ class Watchdog:
 
 
 def record(run_dir: Path, error: BaseException | None) -> Path:
-    """Writes what a developer needs to `fault.txt`: the traceback of `error`, or where every thread is now."""
+    """Writes `fault.txt` for a developer: the traceback of `error`, or where every thread is now; returns its path."""
     path = run_dir / "fault.txt"
     with contextlib.suppress(OSError), path.open("w", encoding="utf-8") as file:
         if error is None:
@@ -170,7 +170,7 @@ def record(run_dir: Path, error: BaseException | None) -> Path:
 
 
 def report_fault(config: Config, what: str, error: EnvironmentFault | None) -> int:
-    """One line on stderr about an environment that raised or hung; returns the exit code."""
+    """Prints one line about an environment that raised or hung; returns the exit code."""
     run_dir = Path(config.run_dir)
     steps = Checkpoints(run_dir / CHECKPOINTS, keep=None).steps()
     saved = f"saved at {steps[-1]:,} env_steps, the same command goes on from there" if steps else "nothing to save yet"

@@ -106,7 +106,7 @@ def test_numbers_that_overflow_end_a_run_with_a_diagnosis_and_good_parameters(tm
     words = ["learner.learning_rate=1e38", "train.max_skipped=3", "train.dump_skipped=true"]
     code, out, err = finish(*SEEK, *words, f"run={tmp_path}")
     assert code == 2 and len(err.splitlines()) == 1
-    assert err.startswith("foajax: error: train.max_skipped=3: so many updates in a row were not finite (loss ")
+    assert err.startswith("foajax: error: train.max_skipped=3: 3 updates in a row were not finite (loss ")
     assert "param_norm inf" in err or "param_norm nan" in err
     stored = load_agent(tmp_path)
     assert f"saved at {stored.env_steps:,} env_steps" in err
@@ -167,5 +167,5 @@ def test_a_run_whose_end_is_not_saved_says_so(run):
     (run / "checkpoints" / ".12800.new").touch()
     code, out, err = finish(*SEEK, f"run={run}", "train.env_steps=12800")
     assert code == 2 and "done" not in out, out
-    said = r"run=.*: it stands at 12,800 env_steps, of which 12,\d{3} are saved; accepted is a directory"
+    said = r"run=.*: it was trained to 12,800 env_steps, but 12,\d{3} are saved; accepted is a directory"
     assert re.search(said, err), err

@@ -53,7 +53,7 @@ def test_the_file_has_what_the_update_had(seek, tmp_path, told):
     seek.collect()
     dump.look(rows)
     (path,) = (tmp_path / "skipped").iterdir()
-    assert told == [f"an update was not finite and skipped: its batch is in {path}"]
+    assert told == [f"skipped an update that was not finite; its batch is in {path}"]
     with safe_open(path, "numpy") as file:
         facts = file.metadata()
     # Every second environment from 1 on is in the second of two minibatches.
