@@ -2,8 +2,8 @@
 
     python benchmarks/foveation.py [out=results.json]
 
-Prints medians over one run, and the device. Frames are float32 and already in the device's memory, results stay
-there; what is compared is timed in turns, so that both see the same machine. Run it on an idle one.
+Prints the device and median times. Frames are float32 in the device's memory, and results stay there. Calls that are
+compared take turns, so that other load slows all alike. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ REPEATS = 200
 
 
 def sensors() -> dict[str, SensorConfig]:
-    """Every sensor of Table II on the canvas and packed, and the log-polar ones."""
+    """Makes every sensor of Table II, on the canvas and packed, and the log-polar ones."""
     packed = {
         f"{name} packed": RingSensor(s.rings, peripheral=s.peripheral, layout="packed") for name, s in TABLE_II.items()
     }
@@ -38,13 +38,13 @@ def sensors() -> dict[str, SensorConfig]:
 
 
 def batch(size: int, shape: tuple[int, int] = (80, 80)) -> tuple[np.ndarray, np.ndarray]:
-    """Random frames, and focal points at which a 70x70 area lies inside 80x80."""
+    """Makes random frames, and focal points at which a 70x70 area lies inside 80x80."""
     rng = np.random.default_rng(0)
     return rng.normal(size=(size, *shape)).astype(np.float32), rng.integers(35, 46, (size, 2)).astype(np.int32)
 
 
 def sensing(sensor: SensorConfig, frames: np.ndarray, points: np.ndarray) -> Callable[[], tuple[jax.Array, ...]]:
-    """A compiled call on arrays in the device's memory; vmapped where there is a batch."""
+    """Makes a compiled call on arrays in the device's memory, vmapped if there is a batch."""
     run = functools.partial(sense, sensor=sensor, bounds="window")
     compiled = jax.jit(jax.vmap(run) if frames.ndim == 3 else run)
     inputs = jnp.asarray(frames), jnp.asarray(points)
@@ -52,7 +52,7 @@ def sensing(sensor: SensorConfig, frames: np.ndarray, points: np.ndarray) -> Cal
 
 
 def per_sensor() -> dict[str, float]:
-    """Microseconds to sense 32 frames of 80x80."""
+    """Times sensing 32 frames of 80x80, in microseconds."""
     calls = {}
     frames, points = batch(32)
     for name, sensor in sensors().items():
@@ -66,7 +66,7 @@ def per_sensor() -> dict[str, float]:
 
 
 def large_frame() -> dict[str, float]:
-    """Microseconds for one frame, small and large, seen by the same sensor."""
+    """Times one small and one large frame with the same sensor, in microseconds."""
     calls = {}
     for height, width in ((80, 80), (1080, 1920)):
         frames, _ = batch(1, (height, width))
@@ -79,7 +79,7 @@ def large_frame() -> dict[str, float]:
 
 
 def against_opencv() -> dict[str, float] | None:
-    """Microseconds for the 35x35 views of 256 frames, against a loop over OpenCV's resize."""
+    """Times the 35x35 views of 256 frames against a loop over OpenCV's resize, in microseconds."""
     try:
         import cv2
     except ImportError:
@@ -104,7 +104,6 @@ def against_opencv() -> dict[str, float] | None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Runs all three and writes JSON where `out=<file>` says so."""
     options = cli.parse(bench.Options, arguments)
     runtime.wait_in_place()
     results: dict[str, object] = {"device": jax.devices()[0].device_kind}

@@ -4,19 +4,17 @@
     python benchmarks/scaling.py [part=allreduce] [out=allreduce.json]
     python benchmarks/scaling.py [part=model]
 
-`weak`: training, a process a core, each pinned to its own, with `envs` environments a process. One process alone;
-two that share a run; and two that do not know of each other, which shows what the machine itself takes for a second
-busy core. Speeds are env_steps a second once everything is compiled, from the third logged row on. Efficiency is the
-speed of two over twice that of one.
+`weak`: training with a process per core, pinned to it, and `envs` environments per process. Measured are one process;
+two that share a run; and two separate runs, which show how far a second busy core slows the machine. Speeds are
+env_steps per second once everything is compiled, from the third logged row on. Efficiency is the speed of two
+processes over twice that of one.
 
-`allreduce`: the sum of a vector over virtual devices of one process (threads, through memory), and over two
-processes (gloo on the loopback address), by the number of parameters. Medians.
+`allreduce`: medians of the time to sum a vector, by the number of parameters: over virtual devices of one process
+(threads, through memory), and over two processes (gloo on the loopback address).
 
-`model`: what bounds bigger machines, from `Assumptions`, each of which says where it comes from.
+`model`: computes what bounds bigger machines from `Assumptions`, each of which says where it comes from.
 
-Where there are no two cores to pin processes to (macOS pins none), `weak` and `allreduce` are left out.
-
-Run it on an idle machine.
+Without two cores to pin processes to (macOS pins none), `weak` and `allreduce` are left out. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -49,8 +47,6 @@ MINIBATCHES = 4
 
 
 class Options(bench.Options):
-    """What the command takes."""
-
     part: Literal["all", "weak", "allreduce", "model", "member"] = Field(
         "all", description="What to measure; member is one process of allreduce."
     )
@@ -65,11 +61,11 @@ class Options(bench.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Assumptions:
-    """Of the model; seconds, bytes and operations."""
+    """What `model` assumes, in seconds, bytes and operations."""
 
     emulator: float = 700e-6  # core-seconds an env_step takes EnvPool (600 to 800 measured on this kind of core)
     decision: float = 7.3e6  # floating-point operations of a decision, constant70_packed (results/bench)
-    learning: float = 3.0  # of an update over those of a decision: forward and twice as much backward
+    learning: float = 3.0  # times a decision's operations: forward, and twice as much backward
     parameters: float = 1.0e6  # exchanged for each minibatch, float32
     screen: float = 210 * 160  # bytes of a frame on its way to the device
     rollout: int = 20
@@ -86,7 +82,7 @@ class Assumptions:
 def start(
     arguments: Sequence[str], *, core: int | None = None, out: IO[str] | int = subprocess.PIPE, **variables: str
 ) -> subprocess.Popen:
-    """A Python process, on one core if asked."""
+    """Starts a Python process, pinned to a core if one is given."""
     pin = [] if core is None else ["taskset", "-c", str(core)]
     environment = os.environ | {"JAX_PLATFORMS": "cpu"} | variables
     return subprocess.Popen(
@@ -95,13 +91,13 @@ def start(
 
 
 def free_address() -> str:
-    """Where the first process of several can listen."""
+    """Finds an address at which the first process of several can listen."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return f"127.0.0.1:{server.getsockname()[1]}"
 
 
 def training(options: Options, run: Path, processes: int, process: int, address: str) -> list[str]:
-    """The words of one process of a run: equal work for each process, whatever their number."""
+    """Makes the command line of one process of a run; each has the same work, whatever their number."""
     words = [f"game={options.game}", f"experiment={options.experiment}", f"run={run}", "env.threads=1"]
     words += [f"env.num_envs={options.envs * processes}", "learner=a2c", f"learner.num_minibatches={MINIBATCHES}"]
     words += ["train.log_every=0.5", "train.env_steps=100000000", "train.checkpoint_every=1000"]
@@ -112,19 +108,19 @@ def training(options: Options, run: Path, processes: int, process: int, address:
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
-    """What a run has logged so far."""
+    """Reads the rows that a run has logged so far."""
     file = run / "metrics.jsonl"
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
 def speed(run: Path, processes: Sequence[subprocess.Popen], seconds: float) -> float:
-    """env_steps a second, from the third row on for so many seconds; then the processes are ended."""
+    """Measures env_steps per second from the third row on, for `seconds`; then ends the processes."""
     try:
         while len(logged := rows(run)) < 4 or logged[-1]["time"] - logged[2]["time"] < seconds:
             for process in processes:
                 if process.poll() is not None:
-                    ended = f"foajax.train ended with exit code {process.returncode}, its output is above"
-                    raise ConfigError(f"part=weak: {ended}; accepted is what it can train")
+                    ended = f"foajax.train ended with exit code {process.returncode}"
+                    raise ConfigError(f"part=weak: {ended}; its output above says why")
             time.sleep(0.2)
     finally:
         for process in processes:
@@ -135,8 +131,8 @@ def speed(run: Path, processes: Sequence[subprocess.Popen], seconds: float) -> f
 
 
 def weak(options: Options, cores: Sequence[int]) -> dict[str, Any]:
-    """Speeds of one process, of two that share a run, and of two runs at a time."""
-    # What training would refuse is said once, and here.
+    """Measures the speeds of one process, of two that share a run, and of two runs at a time."""
+    # Raises what training would refuse once, and before it starts.
     config = compose(training(options, Path("run"), 1, 0, ""))
     make(config, num_envs=1, seed=0).close()
     with tempfile.TemporaryDirectory() as temporary:
@@ -146,7 +142,7 @@ def weak(options: Options, cores: Sequence[int]) -> dict[str, Any]:
             address = free_address()
             words = [training(options, directory / name, processes, i, address) for i in range(processes)]
             words += [training(options, directory / f"{name}-beside", 1, 0, "")] * beside
-            # A pipe that nobody reads would be full one day.
+            # Not to a pipe, which would fill up as nobody reads it.
             started = [
                 start(["-m", "foajax.train", *w], core=core, out=sys.stderr)
                 for core, w in zip(cores, words, strict=False)
@@ -166,7 +162,7 @@ def weak(options: Options, cores: Sequence[int]) -> dict[str, Any]:
 
 
 def allreduce(cores: Sequence[int]) -> dict[str, Any]:
-    """Microseconds of a sum, by devices and parameters."""
+    """Measures microseconds of a sum, by devices and parameters."""
     found: dict[str, Any] = {}
     for devices in DEVICES:
         process = start([__file__, "part=member", f"devices={devices}"], JAX_NUM_CPU_DEVICES=str(devices))
@@ -187,16 +183,16 @@ def allreduce(cores: Sequence[int]) -> dict[str, Any]:
 
 
 def answer(process: subprocess.Popen) -> dict[str, float]:
-    """What a process of `allreduce` has found."""
+    """Waits for a process of `allreduce`; returns what it has found."""
     lines = process.communicate()[0].splitlines() or [""]
     if process.returncode:
         ended = f"a process ended with exit code {process.returncode}"
-        raise ConfigError(f"part=allreduce: {ended} ({lines[-1]}); accepted is a machine on which it can run")
+        raise ConfigError(f"part=allreduce: {ended} ({lines[-1]})")
     return json.loads(lines[-1])
 
 
 def member(options: Options) -> dict[str, float]:
-    """One process of `allreduce`: median microseconds by number of parameters."""
+    """Runs one process of `allreduce`; returns median microseconds by the number of parameters."""
     import jax
     import numpy as np
     from jax.sharding import Mesh, PartitionSpec
@@ -227,7 +223,7 @@ def member(options: Options) -> dict[str, float]:
 
 
 def rollout_seconds(a: Assumptions, *, hosts: int, gpus: int, cores: int, envs: int) -> dict[str, float]:
-    """Where a rollout's time goes, by part; `gpus`, `cores` and `envs` of each host."""
+    """Computes seconds of a rollout by part; `gpus`, `cores` and `envs` are per host."""
     steps = a.rollout * envs  # of a host
     devices, size = hosts * gpus, 4 * a.parameters
     # A ring sends each parameter twice; between hosts the sum also waits for messages, there and back up a tree.
@@ -242,7 +238,7 @@ def rollout_seconds(a: Assumptions, *, hosts: int, gpus: int, cores: int, envs: 
 
 
 def model() -> dict[str, Any]:
-    """env_steps a second, and the share of each part, for the machines in docs/log/2026-11-25-scaling.md."""
+    """Computes env_steps per second and the share of each part for the machines in docs/log/2026-11-25-scaling.md."""
     machines = {
         "1 host, 8 GPUs, 256 cores, 2048 environments": {"hosts": 1, "gpus": 8, "cores": 256, "envs": 2048},
         "1 host, 8 GPUs, 256 cores, 8192 environments": {"hosts": 1, "gpus": 8, "cores": 256, "envs": 8192},
@@ -259,7 +255,6 @@ def model() -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """The command."""
     options = cli.parse(Options, arguments)
     if options.part == "member":
         try:

@@ -2,8 +2,8 @@
 
     python benchmarks/search_cost.py [decisions=8] [out=results.json]
 
-Prints the median time of a decision, one at a time, at 160x160 and 1080x1920, and what an answer takes after so many
-decisions. The frame is in the device's memory, and the four programs take turns. Run it on an idle machine.
+Prints for frames of 160x160 and 1080x1920 the median time of one decision, and of an answer after `decisions` of them.
+The frame is in the device's memory, and the four programs take turns. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -20,14 +20,11 @@ from foajax.reporting import bench, cost, search
 
 
 class Options(bench.Options):
-    """What the command takes."""
-
     decisions: float = Field(8, gt=0, description="Decisions until the answer.")
     repeats: int = Field(200, ge=1, description="Repeats of each timing.")
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measures, and writes JSON where `out=<file>` says so."""
     options = cli.parse(Options, arguments)
     runtime.wait_in_place()
     config = compose(["experiment=search_rings_p"])

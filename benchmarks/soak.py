@@ -2,11 +2,11 @@
 
     python benchmarks/soak.py [minutes=30] [out=soak.json] [run=<dir>] [experiment=... and other keys of a run]
 
-Trains in a process of its own, a new run or the one in `run`, and reads /proc while it does. What counts as the
-beginning is the minute after the first sixth of the time (of 30 minutes the first 5: compilation, and buffers that
-fill once), what counts as the end is the last one (of shorter trials a thirtieth of the time each, and speed over a
-sixth). Exit code 1 if resident memory has grown by more than 2 %, speed has fallen by more than 5 %, or there are
-more open files or threads than at the beginning. Linux only; run it on an otherwise idle machine.
+Trains in a process of its own, a new run or the one in `run`, and reads /proc meanwhile. The first sixth of the time
+does not count: programs are compiled and buffers fill. The next thirtieth is the beginning, the last thirtieth the end:
+a minute each of 30. Speeds are taken over a sixth each. The exit code is 1 if resident memory grew by more than 2 %,
+speed fell by more than 5 %, or more files are open or threads run than at the beginning. Linux only; run it on an
+otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -33,14 +33,12 @@ _EVERY = 1.0  # seconds between two looks
 
 
 class Options(bench.Options):
-    """What the command takes besides the keys of a run."""
-
     minutes: float = Field(30.0, ge=2, description="How long to watch.")
     run: str | None = Field(None, description="Directory of the run; null for a temporary one.")
 
 
 class Sample(NamedTuple):
-    """What one look saw."""
+    """What one look at the process found."""
 
     time: float  # seconds since the process began
     memory: int  # resident, bytes
@@ -49,7 +47,7 @@ class Sample(NamedTuple):
 
 
 def sample(process: int, begin: float) -> Sample:
-    """Reads a process' own account in /proc."""
+    """Reads memory, open files and threads of a process from /proc."""
     proc = Path(f"/proc/{process}")
     status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
     return Sample(
@@ -61,29 +59,29 @@ def sample(process: int, begin: float) -> Sample:
 
 
 def verdict(samples: Sequence[Sample], rows: Sequence[dict], seconds: float) -> dict[str, float]:
-    """Beginning and end of each quantity, over windows of a run of `seconds`.
+    """Summarises each quantity at the beginning and at the end of a run of `seconds`.
 
     Args:
-      samples: in order.
+      samples: in order of time.
       rows: of `metrics.jsonl`; their `time` is the run's own.
       seconds: how long the run was to last.
 
     Raises:
-      ConfigError: too few rows to tell a speed from.
+      ConfigError: there are too few rows to measure a speed.
     """
     settled, window = seconds / 6, seconds / 30
     times = [row["time"] for row in rows] or [0.0]
     early = [row for row in rows if times[0] + settled <= row["time"] <= times[0] + 2 * settled]
     late = [row for row in rows if row["time"] >= times[-1] - settled]
     if min(len(early), len(late)) < 2:
-        accepted = f"enough for two rows of metrics.jsonl in each sixth of them (in all there are {len(rows)})"
+        accepted = f"enough minutes for two rows of metrics.jsonl in each sixth (there are {len(rows)} rows in all)"
         raise ConfigError(f"minutes={seconds / 60:g}: accepted is {accepted}")
     end = samples[-1].time
     first = [s for s in samples if settled <= s.time < settled + window]
     last = [s for s in samples if s.time >= end - window]
     result = {}
     for name in ("memory", "files", "threads"):
-        # A checkpoint being written opens files and has a thread for a moment: the least is what stays.
+        # Writing a checkpoint takes files and a thread for a moment; the least number is what stays.
         pick = statistics.median if name == "memory" else min
         result[f"{name}_begin"], result[f"{name}_end"] = (
             pick(getattr(s, name) for s in part) for part in (first, last)
@@ -93,7 +91,7 @@ def verdict(samples: Sequence[Sample], rows: Sequence[dict], seconds: float) -> 
 
 
 def complaints(result: dict[str, float]) -> list[str]:
-    """What is not as it should be; empty where all is well."""
+    """Lists what has become worse; empty if nothing has."""
     growth = result["memory_end"] / result["memory_begin"] - 1
     fall = 1 - result["speed_end"] / result["speed_begin"]
     found = []
@@ -103,7 +101,7 @@ def complaints(result: dict[str, float]) -> list[str]:
         found.append(f"speed has fallen by {100 * fall:.2f} %")
     for name in ("files", "threads"):
         if result[f"{name}_end"] > result[f"{name}_begin"]:
-            found.append(f"{name} have become more: {result[f'{name}_begin']:.0f}, {result[f'{name}_end']:.0f}")
+            found.append(f"{name} have grown from {result[f'{name}_begin']:.0f} to {result[f'{name}_end']:.0f}")
     return found
 
 
@@ -128,7 +126,6 @@ def train(words: Sequence[str], run: Path, seconds: float) -> tuple[list[Sample]
 
 
 def main(words: Sequence[str]) -> int:
-    """The command."""
     keys = Options.model_fields
     ours = [word for word in words if word.partition("=")[0] in keys]
     options = cli.parse(Options, ours)
@@ -151,12 +148,12 @@ def main(words: Sequence[str]) -> int:
 
 
 def _lines(file: Path) -> list[str]:
-    """What a run has logged; nothing before its first row."""
+    """Reads what a run has logged; empty before its first row."""
     return file.read_text().splitlines() if file.exists() else []
 
 
 def _speed(rows: Sequence[dict]) -> float:
-    """Steps a second between the first and the last of some rows."""
+    """Returns steps per second between the first and the last row."""
     return (rows[-1]["env_steps"] - rows[0]["env_steps"]) / (rows[-1]["time"] - rows[0]["time"])
 
 

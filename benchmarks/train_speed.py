@@ -2,11 +2,10 @@
 
     python benchmarks/train_speed.py [experiments=constant70_packed,nonfoa] [torso=a3c] [learner=default] [out=<file>]
 
-For each experiment, in a process of its own: the environments alone under random actions, `act` alone, `update`
-alone, and the training loop, in turns of a few seconds, `repeats` times over. Printed and written are medians of
-steps/s; `ratio` is the median of end to end / env-only, each of one turn, so that both saw the same machine.
-`core_us` is processor time a step, summed over all cores. Further words (`learner.num_epochs=2`) go to the
-configuration. Run it on an idle machine.
+For each experiment, a process of its own times four parts: the environments alone under random actions, `act` alone,
+`update` alone, and the training loop. They take turns of a few seconds, `repeats` times. Medians of steps/s are printed
+and written. `ratio` is the median of end_to_end / env_only, both of one turn. `core_us` is processor time per step over
+all cores. Further words, such as `learner.num_epochs=2`, go to the configuration. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -43,14 +42,12 @@ PARTS = ("env_only", "act_only", "update_only", "end_to_end")
 
 
 class Options(bench.Options):
-    """What the command takes beside keys of the configuration."""
-
     experiments: str = Field(
         "nonfoa,constant70,constant70_packed,constant70_p_packed,decreasing_packed,logpolar",
         description="Names with commas between them.",
     )
     torso: str = Field("nature", description="Choice of the group network/.")
-    learner: str = Field("a2c", description="Choice of the group learner/: one pass over each step, as others' codes.")
+    learner: str = Field("a2c", description="Choice of the group learner/; a2c makes one pass over each step.")
     num_envs: int = Field(32, ge=1, description="Environments.")
     repeats: int = Field(5, ge=1, description="Turns of each part.")
     seconds: float = Field(3.0, gt=0, description="Seconds per turn of one part.")
@@ -58,7 +55,7 @@ class Options(bench.Options):
 
 
 class Bench:
-    """One experiment's parts, each a call that makes `steps` steps and returns when they are done."""
+    """The parts of one experiment: each call makes `steps` steps and returns when they are done."""
 
     def __init__(self, config: Config, resources: contextlib.ExitStack) -> None:
         self._learner = config.learner
@@ -79,24 +76,24 @@ class Bench:
         self.steps = config.env.num_envs * config.learner.rollout_length
 
     def env_only(self) -> None:
-        """Environments under random actions, each sent on as soon as it is received, and nothing else."""
+        """Steps only the environments, with random actions, each as soon as its last step is received."""
         for _ in range(self._learner.rollout_length):
             for environment in self._alone:
                 environment.recv()
                 self._send_random(environment)
 
     def act_only(self) -> None:
-        """A rollout's decisions, all on the time step that is there."""
+        """Makes a rollout's decisions, all upon the same time step."""
         self._collector.decide(self._state, self._step)
 
     def update_only(self) -> None:
-        """All updates on a rollout."""
+        """Makes all updates of a rollout."""
         rollouts = [group.rollout for group in self._collector.groups]
         self._state, metrics = update_on(rollouts, self._state, self._programs, self._learner)
         jax.block_until_ready(metrics)
 
     def end_to_end(self) -> None:
-        """A rollout and its updates, as training has them: not waited for before the next one."""
+        """Collects a rollout and starts its updates; as in training, the next rollout does not wait for them."""
         rollouts, _ = self._collector.collect(self._state, self._step)
         jax.device_get(self._metrics)
         self._state, self._metrics = update_on(rollouts, self._state, self._programs, self._learner)
@@ -108,14 +105,14 @@ class Bench:
 
 
 def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
-    """One experiment's record."""
+    """Measures one experiment; returns its record."""
     use_compilation_cache()
     keep_memory()
     config = compose(words)
     with contextlib.ExitStack() as resources:
         subject = Bench(config, resources)
         calls = {part: getattr(subject, part) for part in PARTS}
-        for call in reversed(calls.values()):  # compiles; the loop first, so that there is a rollout to learn from
+        for call in reversed(calls.values()):  # compiles; end_to_end first, so that there is a rollout to learn from
             call()
         turns: dict[str, list[tuple[float, float]]] = {part: [] for part in PARTS}
         for _ in range(options.repeats):
@@ -137,7 +134,7 @@ def measure(words: Sequence[str], options: Options) -> dict[str, Any]:
 
 
 def _turn(call: Callable[[], None], steps: int, seconds: float) -> tuple[float, float]:
-    """Steps/s, and microseconds of processor time a step."""
+    """Repeats a call for `seconds`; returns steps/s, and microseconds of processor time per step."""
     count, begin, busy = 0, time.perf_counter(), time.process_time()
     while (taken := time.perf_counter() - begin) < seconds or count == 0:
         call()
@@ -146,7 +143,7 @@ def _turn(call: Callable[[], None], steps: int, seconds: float) -> tuple[float, 
 
 
 def startup(words: Sequence[str], config: Config) -> float:
-    """Seconds of a whole training process of one rollout, its updates and a checkpoint; compiled before."""
+    """Times a training process of one rollout, its updates and a checkpoint, with a filled compilation cache."""
     steps = config.env.num_envs * config.learner.rollout_length
     seconds = 0.0
     for _ in range(2):  # the first one fills the compilation cache
@@ -159,11 +156,10 @@ def startup(words: Sequence[str], config: Config) -> float:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measures every experiment, prints the table, writes JSON."""
     keys = Options.model_fields.keys()
     options = cli.parse(Options, [word for word in arguments if word.partition("=")[0] in keys])
     more = [word for word in arguments if word.partition("=")[0] not in keys]
-    runs = []  # all composed before the first is measured: a mistake in the last one would lose the others
+    runs = []  # composed before the first is measured, so that a mistake in the last one loses nothing
     for name in options.experiments.split(","):
         groups = [f"experiment={name}", f"network={options.torso}", f"learner={options.learner}"]
         words = [*groups, f"env.num_envs={options.num_envs}", *more]
@@ -189,7 +185,7 @@ def _line(record: dict[str, Any]) -> str:
 
 
 def _print(records: Sequence[dict[str, Any]]) -> None:
-    table = Table(title="steps/s (core microseconds a step)")
+    table = Table(title="steps/s (core microseconds per step)")
     for heading in ("experiment", "torso", "envs", *PARTS, "ratio (min-max)", "MB", "start s"):
         table.add_column(heading, justify="left" if heading in ("experiment", "torso") else "right")
     for record in records:

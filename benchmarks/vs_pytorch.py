@@ -1,12 +1,12 @@
-"""The network against the same one in PyTorch: forward, and forward and backward, at the learner's shapes.
+"""How fast is the network against the same one in PyTorch, at the learner's shapes?
 
     python benchmarks/vs_pytorch.py [experiments=nonfoa,constant70_packed] [torso=nature] [num_envs=4] [out=<file>]
 
-Torso, dense layer, LSTM over T+1 = 21 steps (reset where episodes start) and the heads, on the same random images,
-with the same parameters (the outputs are compared first); `update` is the whole step: A2C loss of both heads, its
-gradient, clipping and Adam with AMSGrad, as PyTorch has it by default and (`update_fused`) fused. Both sides run in
-this process, in turns, with all its cores. Speeds are medians, in steps/s. Needs PyTorch (`pip install torch`), which
-foajax itself does not use. Run it on an idle machine.
+The network is torso, dense layer, LSTM over T+1 = 21 steps (reset where episodes start), and heads. Both sides get the
+same random images and parameters, and their outputs are compared first. `forward_backward` is the gradient of a loss
+that costs as much as A2C's. `update` adds clipping and Adam with AMSGrad; `update_fused` takes PyTorch's fused Adam.
+Both sides run in this process, in turns, with all its cores. Speeds are medians, in steps/s. It needs PyTorch, which
+foajax itself does not use: `pip install torch`. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ PARTS = ("forward", "forward_backward", "update", "update_fused")
 
 
 class Options(bench.Options):
-    """What the command takes."""
-
     experiments: str = Field("nonfoa,constant70_packed", description="Names with commas between them.")
     torso: str = Field("nature", description="Choice of the group network/.")
     num_envs: int = Field(4, ge=1, description="Environments of a minibatch.")
@@ -46,7 +44,7 @@ class Options(bench.Options):
 
 
 def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]:
-    """The network of `foajax.networks.network` in PyTorch's own operations, and its parameters as leaves."""
+    """Builds the network of `foajax.networks.network` from PyTorch's operations; returns it and its parameters."""
     import torch
     import torch.nn.functional as F
 
@@ -118,7 +116,7 @@ def torch_network(params: dict, network: NetworkConfig) -> tuple[Callable, list]
 
 
 def flat_loss(outputs: Sequence[Any], log_softmax: Callable, actions: Callable) -> Any:
-    """An actor-critic loss of the right cost: log-probability, value error and entropy of each head."""
+    """Computes a loss that costs as much as A2C's: log-probability, value error and entropy of each head."""
     total = 0.0
     for logits, value in zip(outputs[0::2], outputs[1::2], strict=True):
         log_p = log_softmax(logits)
@@ -127,7 +125,7 @@ def flat_loss(outputs: Sequence[Any], log_softmax: Callable, actions: Callable) 
 
 
 class Inputs(NamedTuple):
-    """What both sides are given."""
+    """What both sides get."""
 
     roi: list[np.ndarray]  # [T+1, B, h, w, 1] each
     side: np.ndarray  # [T+1, B, S]: what the core is told beside the images
@@ -135,7 +133,7 @@ class Inputs(NamedTuple):
 
     @classmethod
     def make(cls, agent: Agent, batch: int) -> Inputs:
-        """Noise."""
+        """Makes random inputs."""
         random = np.random.default_rng(0)
         integers, numbers = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
         width = agent.side(integers, integers, numbers, jnp.zeros(1, bool)).shape[-1]
@@ -147,7 +145,7 @@ class Inputs(NamedTuple):
 
 
 def our_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable]:
-    """foajax's parts; `forward` returns the outputs, `forward_backward` the gradient."""
+    """Makes foajax's calls; `forward` returns the outputs, `forward_backward` the gradient."""
     images, *others = jax.tree.map(jnp.asarray, inputs)
     zeros = jnp.zeros((inputs.is_first.shape[1], agent.config.network.lstm))
     optimizer = make_optimizer(agent.config.learner, 1)
@@ -178,7 +176,7 @@ def our_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable]:
 
 
 def their_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable]:
-    """The same parts in PyTorch."""
+    """Makes the same calls in PyTorch."""
     import torch
 
     config = agent.config
@@ -216,7 +214,7 @@ def their_calls(agent: Agent, params: Any, inputs: Inputs) -> dict[str, Callable
 
 
 def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
-    """One experiment on both sides."""
+    """Measures one experiment on both sides."""
     agent = Agent(config, ACTIONS, None)
     params = agent.initial_params(jax.random.key(0))
     inputs = Inputs.make(agent, options.num_envs)
@@ -236,7 +234,7 @@ def measure(name: str, config: Config, options: Options) -> dict[str, Any]:
 
 
 def _medians(calls: Sequence[Callable], repeats: int) -> list[float]:
-    """Seconds, called in turns of five; each side's threads have time to fall asleep in between."""
+    """Times calls in turns of five, in seconds; in between, the other side's threads have time to fall asleep."""
     times: list[list[float]] = [[] for _ in calls]
     for turn in range(repeats // 5 + 1):
         for call, taken in zip(calls, times, strict=True):
@@ -250,7 +248,6 @@ def _medians(calls: Sequence[Callable], repeats: int) -> list[float]:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measures every experiment, prints a line each, writes JSON."""
     options = cli.parse(Options, arguments)
     configs = {
         name: compose([f"experiment={name}", f"network={options.torso}", "learner=a2c"])

@@ -1,4 +1,4 @@
-"""Environments of other libraries as pixels with discrete actions, for foajax's own learner.
+"""Turns environments of other libraries into pixels with discrete actions, for foajax's own learner.
 
 cd examples
 foajax train game=gymnasium:pixels:MiniGrid env.kwargs.task=MiniGrid-Empty-8x8-v0 experiment=constant50_sub2_packed
@@ -14,17 +14,17 @@ from gymnasium.wrappers import AddRenderObservation, MaxAndSkipObservation, Tran
 
 
 def minigrid(task: str = "MiniGrid-Empty-8x8-v0", tile_size: int = 10, **kwargs) -> gymnasium.Env:
-    """A MiniGrid task, seen from above in colour; `pip install minigrid`."""
+    """Makes a MiniGrid task, seen from above in colour; `pip install minigrid`."""
     from minigrid.wrappers import ImgObsWrapper, RGBImgObsWrapper
 
     return ImgObsWrapper(RGBImgObsWrapper(gymnasium.make(task, **kwargs), tile_size=tile_size))
 
 
 def camera(task: str = "InvertedPendulum-v5", size: int = 84, levels: int = 3, **kwargs) -> gymnasium.Env:
-    """A MuJoCo task as its camera sees it; `pip install "gymnasium[mujoco]"`.
+    """Makes a MuJoCo task as its camera sees it; `pip install "gymnasium[mujoco]"`.
 
-    An action drives one joint and leaves the others at 0. Actions 0 .. joints * levels - 1 give a joint one of `levels`
-    forces, from its least to its greatest. Without a screen set MUJOCO_GL=egl, or osmesa.
+    Action joint * levels + level drives one joint with one of `levels` forces, from its least to its greatest. All
+    other joints get 0. Without a screen set MUJOCO_GL=egl, or osmesa.
     """
     env = AddRenderObservation(gymnasium.make(task, render_mode="rgb_array", width=size, height=size, **kwargs))
     low, high = env.action_space.low, env.action_space.high

@@ -1,10 +1,10 @@
-"""PPO in one file of plain JAX, for what to do and where to look: read it from top to bottom, and change it.
+"""Learns what to do and where to look with PPO, in one file of plain JAX to read and to change.
 
     python ppo_jax.py --game pong --sensor constant70_packed --steps 1000000
 
-The environments are ale-py's, the sensor and the gaze foajax's, everything else is here. Both actions are parts of one
-policy: its log-probability is the sum of theirs, and one value serves both. The network has no memory, so it is shown
-the last four frames.
+The environments are ale-py's; the sensor and the gaze are foajax's; everything else is here. One policy chooses both
+actions: its log-probability is the sum of theirs, and one value serves both. The network has no memory, so it sees the
+last four frames.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ T, EPOCHS, MINIBATCHES, GAMMA, LAMBDA, CLIP, ENTROPY = 128, 4, 4, 0.99, 0.95, 0.
 
 
 def initial_params(key, shape, counts, width=256):
-    """Two convolutions on an image [h, w, c], a dense layer, and three linear heads: both policies and the value."""
+    """Makes parameters: two convolutions for an image [h, w, c], a dense layer, linear heads for policies and value."""
 
     def layer(key, *shape, scale=1.0):
         fan_in = np.prod(shape[:-1])
@@ -49,7 +49,7 @@ def convolve(params, image):
 
 
 def forward(params, image, focal_point):
-    """Logits of both policies, [N, A] and [N, V], and values [N]."""
+    """Returns the logits of both policies, [N, A] and [N, V], and values [N]."""
     x = jnp.concatenate([convolve(params, image / 255.0), focal_point], axis=1)
     x = jax.nn.relu(x @ params["dense"]["w"] + params["dense"]["b"])
     logits = [x @ head["w"] + head["b"] for head in params["heads"]]
@@ -63,7 +63,7 @@ def log_prob(logits, action):
 
 @jax.jit
 def act(params, key, image, focal_point):
-    """Actions [N, 2], their log-probabilities and the values."""
+    """Draws actions [N, 2]; returns them, their log-probabilities and the values."""
     logits, value = forward(params, image, focal_point)
     keys = jax.random.split(key, len(logits))
     action = jnp.stack([jax.random.categorical(k, x) for k, x in zip(keys, logits, strict=True)], axis=1)
@@ -71,10 +71,10 @@ def act(params, key, image, focal_point):
 
 
 def advantages(reward, value, terminated, ignored):
-    """Generalised advantages [T, N]; `value` is [T+1, N].
+    """Returns generalised advantages [T, N]; `value` is [T+1, N].
 
-    A step that is ignored comes after each episode's end, and what follows it does not count before it. So the value of
-    an episode's last frame stands for what a truncated one would still have earned.
+    The step after an episode's end is ignored: no advantage passes it. So the value of an episode's last frame stands
+    for what a truncated episode would still have earned.
     """
     found, last = np.zeros_like(reward), 0.0
     for t in reversed(range(len(reward))):
@@ -102,7 +102,7 @@ def update(params, state, batch, optimizer):
 
 
 def train(game="pong", sensor="constant70_packed", steps=1_000_000, num_envs=8, seed=0, report=print):
-    """Trained parameters, and the returns of all episodes."""
+    """Trains; returns the parameters and the returns of all episodes."""
     env = foajax.FoveatedVectorObservation(
         AtariVectorEnv(game, num_envs, stack_num=4), sensor, dtype=np.uint8, actions="multidiscrete"
     )
@@ -112,7 +112,7 @@ def train(game="pong", sensor="constant70_packed", steps=1_000_000, num_envs=8, 
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(2.5e-4, eps=1e-5))
     state, begun, returns, score = optimizer.init(params), time.perf_counter(), [], np.zeros(num_envs)
     observation, _ = env.reset(seed=seed)
-    ignored = np.zeros(num_envs, bool)  # the step after an episode's end restarts, and its action does nothing
+    ignored = np.zeros(num_envs, bool)  # the step after an episode's end restarts it, whatever the action
     for step in range(0, steps, T * num_envs):
         rows = []
         for t in range(T):

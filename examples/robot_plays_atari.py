@@ -1,8 +1,8 @@
-"""An exported agent plays whole games through ale-py, without JAX and foajax: `python robot_plays_atari.py robot/`.
+"""Plays whole Atari games with an exported agent, without JAX and foajax: `python robot_plays_atari.py robot/`.
 
-A loop of one's own around `Agent.decide`. It needs `numpy onnxruntime ale-py`. The protocol is that of training: each
-action is held for four frames and the brighter pixels of the last two are seen; up to 30 no-ops and FIRE begin a game;
-FIRE begins each further life, with memory and gaze reset.
+It shows how to write a loop around `Agent.decide`, and needs `numpy onnxruntime ale-py`. Games go as in training. Each
+action is held for four frames, of which the last two are seen, each pixel as bright as its brighter one. Up to 30
+no-ops and FIRE begin a game. FIRE begins each further life, with memory and gaze reset.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FRAME_SKIP, NOOPS, MOST_STEPS = 4, 30, 27_000
 
 
 def play(agent, emulator: ALEInterface, actions: list[Action], random: np.random.Generator) -> tuple[float, int]:
-    """One whole game: its unclipped score and how many decisions it took."""
+    """Plays one whole game; returns its unclipped score and its number of decisions."""
     emulator.reset_game()
     see = emulator.getScreenRGB if agent.facts["color"] else emulator.getScreenGrayscale
     screen, reward = begin(emulator, see, actions, int(random.integers(NOOPS + 1)))
@@ -43,7 +43,7 @@ def play(agent, emulator: ALEInterface, actions: list[Action], random: np.random
 def begin(
     emulator: ALEInterface, see: Callable[[], np.ndarray], actions: list[Action], noops: int
 ) -> tuple[np.ndarray, float]:
-    """No-ops, a frame each, then FIRE where the game has it: the first screen, and what was earned meanwhile."""
+    """Plays no-ops, a frame each, then FIRE if the game has it; returns the screen and what was earned meanwhile."""
     reward = float(sum(emulator.act(Action.NOOP) for _ in range(noops)))
     screen, gained = step(emulator, see, Action.FIRE if Action.FIRE in actions else Action.NOOP, frames=1)
     return screen, reward + gained
@@ -52,7 +52,7 @@ def begin(
 def step(
     emulator: ALEInterface, see: Callable[[], np.ndarray], action: Action, frames: int = FRAME_SKIP
 ) -> tuple[np.ndarray, float]:
-    """Holds an action for some frames: the brighter pixels of the last two, as the agent sees them, and the reward."""
+    """Holds an action for some frames; returns the brighter pixels of the last two, and the reward."""
     screens, reward = [], 0.0
     for _ in range(frames):
         reward += emulator.act(action)
@@ -63,9 +63,8 @@ def step(
 
 
 def main() -> None:
-    """The command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", help="what foajax export wrote")
+    parser.add_argument("folder", help="folder that foajax export wrote")
     parser.add_argument("--games", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--greedy", action="store_true")

@@ -1,11 +1,11 @@
-"""stable-baselines3's PPO learns what to do and where to look.
+"""Learns what to do and where to look with stable-baselines3's PPO.
 
     pip install foajax stable-baselines3
     python stable_baselines3_ppo.py ALE/Pong-v5 --steps 1000000
 
-PPO takes both actions as one `MultiDiscrete`, [natural, visual]. `VecNormalize` scales each value of an image by its
-own mean and deviation, or a small ball would hardly show. `MultiInputPolicy` would flatten such images, and its network
-for images wants 36x36 pixels at least, so the features here are their own.
+PPO gives both actions as one `MultiDiscrete`, [natural, visual]. `VecNormalize` scales each value of an image by its
+own mean and deviation, or a small ball would hardly show. `MultiInputPolicy` would flatten such images, and its own
+network needs 36x36 pixels at least. So `Features` reads them instead.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ gymnasium.register_envs(ale_py)
 
 
 def see(env: gymnasium.Env, sensor: str) -> gymnasium.Env:
-    """The last four frames of an Atari game, through a sensor. Lives are episodes and rewards are signs."""
+    """Shows the last four frames of an Atari game through a sensor. Lives are episodes, and rewards are signs."""
     env = gymnasium.wrappers.FrameStackObservation(AtariWrapper(env), 4)  # PPO has no memory
     return foajax.FoveatedObservation(env, sensor, actions="multidiscrete")
 
 
 class Features(BaseFeaturesExtractor):
-    """Two small convolutions for each image, [h, w, c], and a dense layer that has the focal point too."""
+    """Two small convolutions per image [h, w, c], then a dense layer on their features and the focal point."""
 
     def __init__(self, observation_space: gymnasium.spaces.Dict) -> None:
         super().__init__(observation_space, features_dim=256)
@@ -56,7 +56,7 @@ class Features(BaseFeaturesExtractor):
 
 
 def train(game: str, sensor: str, steps: int, num_envs: int, seed: int = 0) -> PPO:
-    """A trained model; `steps` are those of all environments together."""
+    """Trains a model for `steps`, of all environments together."""
     emulator = {"frameskip": 1, "repeat_action_probability": 0.0}
     kwargs = {"env_kwargs": emulator, "wrapper_class": see, "wrapper_kwargs": {"sensor": sensor}}
     envs = make_vec_env(game, num_envs, seed=seed, **kwargs)  # scores are of whole games, from before the wrapper

@@ -27,7 +27,7 @@ COMMANDS = {
 
 
 def main() -> None:
-    """Runs the command that the first word names, as its module would run by itself."""
+    """Runs the command that the first word names, as `python -m foajax.<command>` does."""
     name, *words = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
         print("foajax <command> [key=value ...]; foajax <command> --help says what a command takes.\n")

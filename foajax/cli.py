@@ -27,10 +27,10 @@ def parse(options: type[SectionT], arguments: Sequence[str]) -> SectionT:
 
 
 def override(config: SectionT, arguments: Sequence[str], prefix: str, keys: Sequence[str]) -> SectionT:
-    """`config`, a part of a run's, with the values of `<prefix>.key=value` words for some of its `keys`.
+    """Returns a section of a run's configuration, changed by `<prefix>.key=value` words.
 
     Raises:
-      ConfigError: another key, or a value that it does not accept.
+      ConfigError: a key that is not one of `keys`, or a value that is not accepted.
     """
     values = _values([word.removeprefix(f"{prefix}.") for word in arguments], type(config), f"{prefix}.")
     for key, value in values.items():
@@ -43,7 +43,7 @@ def override(config: SectionT, arguments: Sequence[str], prefix: str, keys: Sequ
 
 
 def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The directories among the words, which a sweep may have named with a "=", and the other words."""
+    """Separates directories, whose names may hold a "=", from the other words."""
     directories = [word for word in arguments if "=" not in word or os.path.isdir(word)]
     others = [word for word in arguments if word not in directories]
     for word in others:
@@ -69,7 +69,7 @@ def _values(arguments: Sequence[str], cls: type[Section], prefix: str) -> dict[s
 
 
 def _value(key: str, text: str, node: Mapping[str, Any]) -> Any:
-    """What a word says. YAML reads 010 as 8, 1:30 as 90 and 1e1 as text, so that numbers are Python's."""
+    """Reads a value as YAML, but numbers as Python does: YAML takes 010 for 8, 1:30 for 90 and 1e1 for text."""
     kinds = {each.get("type") for each in node.get("anyOf", [node])} - {"null"}
     if text not in ("", "null"):
         for name, kind in {"string": str, "integer": int, "number": float}.items():
@@ -77,7 +77,7 @@ def _value(key: str, text: str, node: Mapping[str, Any]) -> Any:
                 try:
                     return kind(text)
                 except ValueError:
-                    return text  # which is refused in the words of the others
+                    return text  # `build` refuses it
     try:
         return yaml.safe_load(text or "null")
     except (yaml.YAMLError, ValueError):  # the latter from what looks like a date
@@ -85,7 +85,7 @@ def _value(key: str, text: str, node: Mapping[str, Any]) -> Any:
 
 
 def check_file(key: str, path: str | None) -> None:
-    """`ConfigError`, before anything long starts, where `path` is given and cannot be a file."""
+    """Raises `ConfigError` if a file could not be written to `path`; call it before anything long starts."""
     if path is None:
         return
     file = Path(path).absolute()
@@ -94,7 +94,7 @@ def check_file(key: str, path: str | None) -> None:
 
 
 def write_json(key: str, path: str, found: Any) -> None:
-    """Writes what a command has found; prints it, so that it is not lost, and raises `ConfigError` where that fails."""
+    """Writes what a command has found. If that fails, prints it, so that it is not lost, and raises `ConfigError`."""
     text = json.dumps(found, indent=1) + "\n"
     try:
         Path(path).write_text(text, encoding="utf-8")
@@ -104,9 +104,9 @@ def write_json(key: str, path: str, found: Any) -> None:
 
 
 def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str] | None = None) -> int:
-    """Runs a command; what the user can mend is one line on stderr and exit code 2.
+    """Runs a command; returns its exit code. A mistake of the user becomes one line on stderr and exit code 2.
 
-    `--help` prints what the command's module says of itself, and the keys of its `Options`.
+    `--help` prints the docstring of the command's module and the keys of its `Options`.
     """
     words = sys.argv[1:] if arguments is None else arguments
     module = sys.modules[command.__module__]
@@ -128,7 +128,7 @@ def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str]
 
 
 def make_directory(out: str | Path) -> Path:
-    """Creates the directory for results; one line where that cannot be."""
+    """Creates the directory for results; raises `ConfigError` if it cannot be written."""
     try:
         Path(out).mkdir(parents=True, exist_ok=True)
         if not os.access(out, os.W_OK | os.X_OK):

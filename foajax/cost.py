@@ -1,13 +1,13 @@
 """Measures what a decision costs, sensor by sensor: `foajax cost experiments=constant70_packed,nonfoa`.
 
-A decision is sense, torso, LSTM, heads and sampling, from a preprocessed, normalised frame; no game is started. FLOPs
+A decision is sensor, torso, core, heads and sampling, from a preprocessed, normalised frame; no game is started. FLOPs
 are XLA's count of the program before it compiles it for a device: 2 per multiply-add of a convolution or matrix
 product, 1 per other elementwise operation. So they do not depend on the device. A loop counts as one turn, and the
 sensor's repair of an area that overhangs the frame always counts. Times are medians of repeats; experiments take turns,
 so that other load on the machine slows all of them alike.
 
 `target=onnx` times the folders that `foajax export` writes, on one thread (extra `robot`): from a screen, and from a
-camera's image, to the next focal point.
+camera's image, to the next focal point. Only experiments with frames of 80x80 can be timed so.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from foajax import cli
-from foajax.config.compose import list_experiments
+from foajax.config.compose import compose, list_experiments
 from foajax.config.parse import Section, refuse
 from foajax.reporting import bench
 from foajax.reporting.cost import BATCHES, PARTS, REFERENCE, measure
@@ -33,8 +33,6 @@ from foajax.runtime import wait_in_place
 
 
 class Options(Section):
-    """What the command takes."""
-
     experiments: str | None = Field(None, description="Experiments, with commas between them; null for all.")
     torso: Literal["nature", "a3c"] = Field("nature", description="The network's convolutions.")
     json_file: str | None = Field(None, alias="json", description="JSON file to write the result to.")
@@ -53,12 +51,17 @@ class Options(Section):
 
     @property
     def names(self) -> list[str]:
-        """The experiments to measure."""
-        return list_experiments() if self.experiments is None else self.experiments.split(",")
+        if self.experiments is not None:
+            return self.experiments.split(",")
+        return [name for name in list_experiments() if self.target == "jax" or is_exportable(name)]
+
+
+def is_exportable(experiment: str) -> bool:
+    """Whether `target=onnx` can time an experiment: whether its frames are Atari's."""
+    return compose([f"experiment={experiment}"]).env.frame_shape == (80, 80)
 
 
 def cost(arguments: Sequence[str]) -> None:
-    """The command."""
     options = cli.parse(Options, arguments)
     wait_in_place()
     if options.target == "onnx":
@@ -129,8 +132,8 @@ def _print_exported(records: Sequence[dict[str, Any]]) -> None:
     console = Console(width=170, highlight=False)
     console.print(table)
     console.print(
-        "frame, sense and network make up screen, a whole decision; torso is a part of network. Energy is an estimate "
-        "from operations and bytes read."
+        "screen is a whole decision: frame, sense and network; torso is a part of network. camera is a decision from a "
+        "colour image of 1080x1920. Energy is estimated from operations and bytes read."
     )
 
 

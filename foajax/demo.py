@@ -36,8 +36,6 @@ _LOOK_AT = """What to look at:
 
 
 class Options(Section):
-    """What the command takes."""
-
     game: str | None = Field(None, description="Game to play; null for breakout, else pong, else any with an agent.")
     agent: str | None = Field(None, description="A shipped agent's name, or a directory; null for the game's best.")
     out: str = Field("demo", description="Directory of the page.")
@@ -48,10 +46,10 @@ class Options(Section):
 
 
 def choose(directory: Path, game: str | None) -> Path:
-    """The best agent for a game: one that moves its gaze before others, then by the mean score.
+    """Chooses the best shipped agent for a game: of those with a learned gaze, if there are any, the best scorer.
 
     Raises:
-      ConfigError: there is none.
+      ConfigError: there is no agent for the game.
     """
     shipped: dict[str, list[Path]] = {}
     for file in sorted(directory.glob("*/config.yaml")):
@@ -69,7 +67,6 @@ def choose(directory: Path, game: str | None) -> Path:
 
 
 def demo(arguments: Sequence[str]) -> None:
-    """The command; prints what is played, the score, the page's address and what to look at."""
     options = cli.parse(Options, arguments)
     path = Path(options.agent) if options.agent else choose(agents(), options.game)
     stored, directory = load_agent(path, trust=options.trust, key="agent"), cli.make_directory(options.out)
@@ -96,9 +93,9 @@ def demo(arguments: Sequence[str]) -> None:
     print(f"Watch it: {page}\n{_LOOK_AT}")
     if config.searches:
         print(
-            f"Of {games} scenes it answered {len(right)} right; this is the longest of {'these' if right else 'all'}."
+            f"It answered {len(right)} of {games} scenes right. The page shows the longest of "
+            f"{'these' if right else 'all'}.\nThe search in one picture: {directory / 'scanpath.png'}"
         )
-        print(f"The search in one picture: {directory / 'scanpath.png'}")
     if _wants(options.open):
         webbrowser.open(page)
 

@@ -37,7 +37,6 @@ class Options(Section):
 
 
 def doctor(arguments: Sequence[str]) -> int:
-    """The command; prints a table."""
     cli.parse(Options, arguments)
     table, missing = Table.grid(padding=(0, 2)), list(_missing("foajax"))
     rows = {
@@ -51,7 +50,8 @@ def doctor(arguments: Sequence[str]) -> int:
     }
     for extra, use in EXTRAS.items():
         added = ", ".join(_missing("foajax", extra))
-        rows[f"extra {extra}"] = f"{use}: {f'would add {added}' if added else 'installed'}"
+        remedy = f"pip install 'foajax[{extra}]' would add {added}"
+        rows[f"extra {extra}"] = f"{use}: {remedy if added else 'installed'}"
     for name, text in rows.items():
         table.add_row(name, text)
     Console(highlight=False, markup=False).print(table)
@@ -59,7 +59,7 @@ def doctor(arguments: Sequence[str]) -> int:
 
 
 def _missing(package: str, extra: str = "") -> Iterator[str]:
-    """What is not installed, or of another version, of all that a package needs; of an extra, of what it adds."""
+    """Lists what a package needs, or what its extra adds, and is not installed or has a version that does not fit."""
     needed = importlib.metadata.requires(package) or [] if version(package) else [package]
     for requirement in map(Requirement, needed):
         if _applies(requirement, extra) and not (extra and _applies(requirement, "")):
@@ -86,7 +86,7 @@ def _devices() -> str:
         return f"none: {one_line(error)}"
     words = [f"{device.device_kind}{_free(device)}" for device in devices]
     if devices[0].platform == "cpu" and shutil.which("nvidia-smi"):
-        words.append("an NVIDIA GPU is there and not used: install the extra cuda")
+        words.append("the NVIDIA GPU is not used: pip install 'foajax[cuda]'")
     return ", ".join(words)
 
 

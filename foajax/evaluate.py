@@ -34,8 +34,6 @@ _PROTOCOL = (
 
 
 class Options(Section):
-    """What the command takes."""
-
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     episodes: int = Field(100, ge=1, description="Games to play.")
     policy: Literal["sampled", "greedy"] = Field(
@@ -54,7 +52,6 @@ class Options(Section):
 
 
 def evaluate(arguments: Sequence[str]) -> None:
-    """The command."""
     protocol = [word for word in arguments if word.startswith(("env.", "search."))]
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
     stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
@@ -97,7 +94,7 @@ def evaluate(arguments: Sequence[str]) -> None:
 
 
 def _print(result: dict) -> None:
-    table = Table("game", "experiment", "policy", "games", "mean", "std. error", "min", "median", "max", "steps a game")
+    table = Table("game", "experiment", "policy", "games", "mean", "std. error", "min", "median", "max", "steps/game")
     returns = np.array(result["returns"])
     error = "" if result["stderr"] is None else f"{result['stderr']:.2f}"
     table.add_row(
@@ -117,7 +114,7 @@ def _print(result: dict) -> None:
     if result["measures"]:
         console.print(", ".join(f"{name} {value:.3g}" for name, value in result["measures"].items()))
     if result["cut"]:
-        console.print(f"{result['cut']} of them were cut at env.max_episode_steps")
+        console.print(f"{result['cut']} of the games were cut at env.max_episode_steps")
 
 
 if __name__ == "__main__":

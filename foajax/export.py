@@ -20,8 +20,6 @@ from foajax.runs.agents import load_agent
 
 
 class Options(Section):
-    """What the command takes."""
-
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str = Field(description="Directory of the folder to write.")
     checkpoint: Literal["newest", "best"] = Field(
@@ -35,7 +33,6 @@ class Options(Section):
 
 
 def export(arguments: Sequence[str]) -> None:
-    """The command."""
     options = cli.parse(Options, arguments)
     try:
         import onnx  # noqa: F401

@@ -20,8 +20,6 @@ from foajax.reporting import bench, kept, results
 
 
 class Options(Section):
-    """What the command takes."""
-
     run: str | None = Field(None, description="A run's directory; null to make the tables and figures anew only.")
     name: str | None = Field(None, description="Directory to keep it in; null for <experiment>-s<seed>.")
 
@@ -31,10 +29,9 @@ class Options(Section):
 
 
 def keep(arguments: Sequence[str]) -> None:
-    """The command; prints where a run is kept."""
     options = cli.parse(Options, arguments)
     if not kept.KEPT.is_dir():
-        raise refuse(str(kept.KEPT), accepted="a checkout, which has kept runs", why="is missing")
+        raise refuse(str(kept.KEPT), accepted="a checkout of foajax, which has this directory", why="is missing")
     if options.run is not None:
         print(kept.keep(Path(options.run), options.name))
     runs = kept.runs()

@@ -20,8 +20,6 @@ from foajax.viewing.recording import progress_bar, watch
 
 
 class Options(Section):
-    """What the command takes."""
-
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str = Field("player", description="Directory of the page.")
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
@@ -31,7 +29,6 @@ class Options(Section):
 
 
 def player(arguments: Sequence[str]) -> None:
-    """The command; prints the path of the page."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
     stored, directory = load_agent(options.run, trust=options.trust), cli.make_directory(options.out)

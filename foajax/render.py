@@ -25,8 +25,6 @@ from foajax.viewing.video import why_no_mp4, write_video
 
 
 class Options(Section):
-    """What the command takes."""
-
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str | None = Field(None, description="Directory of the files; null for render/ in the run's.")
     episodes: int = Field(1, ge=1, description="Games to play.")
@@ -45,7 +43,6 @@ class Options(Section):
 
 
 def render(arguments: Sequence[str]) -> None:
-    """The command; prints the paths of what it wrote."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
     stored = load_agent(options.run, trust=options.trust)

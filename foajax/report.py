@@ -4,8 +4,8 @@ The page needs no other file. It shows learning curves, final scores, where the 
 differ. Runs of the same experiment on the same game count as seeds. Each figure is written as a PNG too.
 
 The report uses what `render`, `player out=<run>/player` and `evaluate json=<run>/score.json` left in a run's directory.
-It makes a missing heat map itself, unless `episodes=0`. A heat map counts as missing unless the newest checkpoint
-played it, in whole games with sampled actions.
+If no run of an experiment has a heat map, the first one plays for it, unless `episodes=0`. A heat map counts only if
+the newest checkpoint played it, in whole games with sampled actions.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ from foajax.runtime import wait_in_place
 
 
 class Options(Section):
-    """What the command takes besides the runs."""
-
     out: str = Field("report", description="Directory of the page.")
     preset: Literal["constant", "decreasing", "peripheral"] | None = Field(
         None, description="Show only the experiments of one of the paper's figures."
@@ -38,7 +36,6 @@ class Options(Section):
 
 
 def report(arguments: Sequence[str]) -> None:
-    """The command; prints the path of the page."""
     paths, others = cli.split(arguments)
     options = cli.parse(Options, others)
     if not paths:
@@ -49,7 +46,7 @@ def report(arguments: Sequence[str]) -> None:
     shown = {run.path for run in runs_of(games)}
     if hidden := [f"{run.path} ({run.config.name})" for run in runs if run.path not in shown]:
         note(f"preset={options.preset} leaves out {', '.join(hidden)}")
-    cli.make_directory(options.out)  # before games are played for what could not be written
+    cli.make_directory(options.out)  # before games are played in vain
     maps = find_maps(games, options.episodes)
     try:
         print(build(games, maps, out=options.out, preset=options.preset, repeats=options.repeats))

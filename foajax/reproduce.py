@@ -1,9 +1,10 @@
 """Runs the paper's comparison and evaluates each run in 100 games: `foajax reproduce stage=1 jobs=2`.
 
-Each learned gaze plays ten more games for its heat map. `experiments/plans/paper.yaml` lists the stages; `plan=search`
-takes those of visual search. A finished run is skipped and a stopped one goes on, so repeat the command until nothing
-is left. `show=table` says how far each run is. `show=commands` prints a command for each run that is left, for a
-cluster's job array. `foajax keep run=<dir>` keeps a run and updates docs/results.md.
+Each learned gaze plays ten more games for its heat map. `experiments/plans/paper.yaml` lists the stages. `plan=search`
+takes those of visual search, with 2,000 scenes for each run and no heat map. A finished run is skipped and a stopped
+one goes on, so repeat the command until nothing is left. `show=table` says how far each run is. `show=commands` prints
+a command for each run that is left, for a cluster's job array. `foajax keep run=<dir>` keeps a run and updates
+docs/results.md.
 """
 
 from __future__ import annotations
@@ -32,8 +33,6 @@ _WATCHED = 10  # games in which a learned gaze is watched
 
 
 class Options(Section):
-    """What the command takes."""
-
     plan: Literal["paper", "search"] = Field("paper", description="Which comparison, of experiments/plans/.")
     stage: int | None = Field(None, description="Which stage to run; null for all, one after another.")
     jobs: int = Field(1, ge=1, description="Runs at a time, each with its share of the cores.")
@@ -48,12 +47,12 @@ class Options(Section):
 
 
 def stages(plan: str) -> list[dict[str, Any]]:
-    """The stages of a plan of `experiments/plans/`: what each is `about`, and the words of its sweeps."""
+    """Reads the stages of a plan of `experiments/plans/`: what each is `about`, and the words of its sweeps."""
     return yaml.safe_load((shipped.experiments() / "plans" / f"{plan}.yaml").read_text())["stages"]
 
 
 def reproduce(arguments: Sequence[str]) -> int:
-    """The command; 1 where a run failed."""
+    """Runs the command; returns 1 if a run failed, else 0."""
     options = cli.parse(Options, arguments)
     chosen = [stage for i, stage in enumerate(stages(options.plan), 1) if options.stage in (None, i)]
     planned = [
@@ -75,7 +74,7 @@ def reproduce(arguments: Sequence[str]) -> int:
 
 
 def _play(runs: Sequence[sweep.Run], jobs: int) -> int:
-    """Plays the games of finished runs: for their scores, and for heat maps of learned gazes; 1 where that failed."""
+    """Plays finished runs for their scores, and learned gazes for heat maps too; returns 1 if that failed, else 0."""
     commands = []
     for run in runs:
         where = run.config.run_dir

@@ -1,6 +1,6 @@
-"""What is set once for a whole process: memory, the compilation cache, where programs run.
+"""Sets what holds for a whole process: memory, the compilation cache, where programs run.
 
-Everyone may import it, so JAX is left to the functions.
+Everyone may import it, so only its functions import JAX.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ os.register_at_fork(after_in_child=_mark_fork)
 
 
 def refuse_fork() -> None:
-    """`RuntimeError` where JAX would hang: its threads do not survive a fork."""
+    """Raises `RuntimeError` in a forked process, where JAX would hang: its threads do not survive a fork."""
     if _forked:
         raise RuntimeError(
-            "JAX in a forked process: accepted is multiprocessing with 'spawn' or 'forkserver',"
-            " or NumPy, foajax.numpy, with a RingSensor or a LogPolarSensor"
+            "JAX hangs in a forked process: accepted is multiprocessing with 'spawn' or 'forkserver',"
+            " or foajax.numpy, which needs no JAX, with a RingSensor or a LogPolarSensor"
         )
 
 
@@ -37,9 +37,8 @@ def keep_memory() -> bool:
     """Makes the C library keep freed memory for the next allocation; returns whether it does.
 
     XLA on the CPU allocates a program's temporary arrays at each call. Above 32 MB glibc gives such memory back to
-    the system, and each call pays for its pages anew: up to half the time of an update. Threads have arenas of their
-    own, which hold no block of 64 MB whatever is set, and so share one: call this before they are started. Only glibc
-    has these switches.
+    the system, and each call pays for its pages anew: up to half the time of an update. A thread's own arena never
+    keeps a block of 64 MB, so all threads share one: call this before they are started. Only glibc has these switches.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -51,7 +50,7 @@ def keep_memory() -> bool:
 
 
 def use_compilation_cache() -> None:
-    """Compiled programs are kept for the next start, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
+    """Keeps compiled programs for the next start, in JAX_COMPILATION_CACHE_DIR or the user's cache."""
     import jax
 
     if jax.config.values["jax_compilation_cache_dir"] is None:
@@ -60,9 +59,9 @@ def use_compilation_cache() -> None:
 
 
 def wait_in_place() -> None:
-    """Has programs on the CPU run on the thread that calls them; without effect once anything was computed.
+    """Makes programs on the CPU run in the thread that calls them; without effect once JAX has computed anything.
 
-    JAX hands them to another thread and back, which takes 40 to 60 us. A robot that waits for each decision does not.
+    JAX hands a program to another thread and back, which takes 40 to 60 us and helps only callers that do not wait.
     """
     import jax
 

@@ -28,8 +28,6 @@ from foajax.viewing.sheet import ALL, contact_sheet, draw, save
 
 
 class Options(Section):
-    """What the command takes besides keys of the sensor."""
-
     sensor: str = Field("constant70", description="A sensor, as `foajax train --help` lists them, or all.")
     game: str = Field("breakout", description="The game whose frame is shown.")
     points: tuple[Point, ...] = Field((), description="Focal points in frame pixels; none for the frame's centre.")
@@ -48,7 +46,7 @@ class Options(Section):
 
 
 def walk(config: Config, steps: int) -> np.ndarray:
-    """The frame after `steps` random actions, float32 [H, W] or, in colour, [H, W, 3] in [0, 1]."""
+    """Plays `steps` random actions; returns the frame, float32 [H, W] or, in colour, [H, W, 3] in [0, 1]."""
     environment = make(config, num_envs=1, seed=config.seed)
     try:
         timestep, _ = environment.reset()
@@ -62,7 +60,6 @@ def walk(config: Config, steps: int) -> np.ndarray:
 
 
 def show(arguments: Sequence[str]) -> None:
-    """The command; prints the path of what it wrote."""
     own = [word for word in arguments if word.startswith("sensor.")]
     options = cli.parse(Options, [word for word in arguments if word not in own])
     sheet = options.all or options.sensor == "all"

@@ -32,7 +32,7 @@ _COLOURS = {"running": "green", "finished": "blue", "failed": "red", "stalled": 
 
 
 def table(runs: Sequence[RunStatus]) -> Table:
-    """All runs, a row each, and how many are in which state."""
+    """Lists all runs, a row each, and counts them by state."""
     counts = [f"{sum(r.state == state for r in runs)} {state}" for state in dict.fromkeys(r.state for r in runs)]
     drawn = Table(title=f"{len(runs)} run{'s' * (len(runs) != 1)}: {', '.join(counts)}" if runs else "no runs yet")
     drawn.add_column("run", overflow="fold")
@@ -54,14 +54,11 @@ def table(runs: Sequence[RunStatus]) -> Table:
 
 
 class Options(Section):
-    """What the command takes after its directories."""
-
     every: float = Field(2.0, gt=0, le=86_400, description="Seconds between two updates of the table.")
     once: bool = Field(False, description="Print the table once and end, as always where the output is no terminal.")
 
 
 def status(arguments: Sequence[str]) -> None:
-    """The command."""
     directories, others = cli.split(arguments)
     options, directories = cli.parse(Options, others), directories or ["runs"]
     console = Console(highlight=False)

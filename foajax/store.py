@@ -28,15 +28,13 @@ def _read_score(file: Path, stored: TrainedAgent) -> dict[str, Any]:
         found = {key: result[key] for key in expected}
         score = {key: result[key] for key in ("mean", "stderr", "episodes", "policy")}
     except (OSError, ValueError, KeyError, TypeError):
-        raise refuse("score", file, "a file that evaluate json=<file> has written") from None
+        raise refuse("score", file, "a file that foajax evaluate json=<file> has written") from None
     if found != expected:
         raise refuse("score", file, f"that of this agent, {expected}", why=f"is of {found}")
     return score
 
 
 class Options(Section):
-    """What the command takes."""
-
     run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
     out: str = Field(description="Directory of the agent.")
     checkpoint: Literal["newest", "best"] = Field(
@@ -47,7 +45,6 @@ class Options(Section):
 
 
 def export(arguments: Sequence[str]) -> None:
-    """The command."""
     options = cli.parse(Options, arguments)
     stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
     score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)

@@ -16,9 +16,9 @@ from foajax.training.watchdog import EnvironmentFault, report_fault
 
 
 def train(config: Config) -> int:
-    """One run from its newest checkpoint, or from nothing, to `train.env_steps`; or a profile of it.
+    """Trains from the newest checkpoint, or from nothing, to `train.env_steps`; or profiles a short run.
 
-    Returns the exit code: 0 where the run is done or has been asked to stop, `FAULT` where an environment failed.
+    Returns the exit code: 0 if the run is done or was asked to stop, `FAULT` if an environment failed.
     """
     use_compilation_cache()
     keep_memory()

@@ -1,7 +1,7 @@
-"""The records that travel between the parts. Every field carries its shape.
+"""Defines the records that travel between the packages. Every field carries its shape.
 
 T rollout length, B environments, H W frame, A natural and V visual actions, L width of the LSTM.
-One progress unit everywhere: ``env_steps``, agent steps summed over environments.
+Progress is counted in `env_steps`: agent steps, summed over environments.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
 
 
 class CoreState(NamedTuple):
-    """Carry of the LSTM."""
+    """The state of the LSTM."""
 
     cell: Float[Array, "B L"]
     hidden: Float[Array, "B L"]
@@ -59,8 +59,8 @@ class ActorState(NamedTuple):
     focal_point: Int[Array, "B 2"]  # (y, x) in frame pixels, used to sense the next frame
     age: Int[Array, "B"]  # steps since the episode began, for a scripted gaze
     last_actions: Int[Array, "B 2"] | None = None  # natural, visual; None where the network is not told
-    # Prices of the last two saccades, to be taken from the next reward and from the one after it (`Agent.act`);
-    # None where saccades are free.
+    # Prices of the last two saccades, which the next reward and the one after it pay (`Agent.act`); None where saccades
+    # are free.
     owed: Float[Array, "B 2"] | None = None
 
 

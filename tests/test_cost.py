@@ -136,6 +136,12 @@ def test_a_mistake_is_one_line(word, message, capsys):
     assert error.count("\n") == 1
 
 
+def test_all_experiments_that_can_be_exported_are_timed():
+    timed = command.Options(target="onnx").names
+    assert "nonfoa" in timed and "search_full" not in timed
+    assert set(timed) < set(command.Options().names)
+
+
 def test_a_run_of_its_own_is_measured():
     config = compose(["sensor=rings", "sensor.rings=[[24,24,2]]", "name=mine", "network.dense=8", "network.lstm=8"])
     (record,) = cost.measure_decisions([config], repeats=2)

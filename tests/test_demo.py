@@ -108,7 +108,7 @@ def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
     assert "is of {'game': 'chess'" in capsys.readouterr().err
     (tmp_path / "score.json").write_text("{}")
     assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 2
-    assert "accepted is a file that evaluate json=<file> has written" in capsys.readouterr().err
+    assert "accepted is a file that foajax evaluate json=<file> has written" in capsys.readouterr().err
 
 
 def test_a_run_is_not_overwritten_by_an_agent(breakout_agent, tmp_path):

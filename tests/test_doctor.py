@@ -34,7 +34,7 @@ def test_what_is_there_is_said(needed, monkeypatch, capsys):
     assert cli.run(doctor.doctor, []) == 0
     said = words(capsys)
     assert "missing nothing devices cpu" in said and "jax 0.2" in said and "GB free" in said
-    assert "extra video writes videos as mp4; without it they are GIFs: would add filming" in said
+    assert "extra video writes videos as mp4" in said and "pip install 'foajax[video]' would add filming" in said
 
 
 def test_a_missing_and_an_old_package_are_named(needed, monkeypatch, capsys):

@@ -48,7 +48,7 @@ def test_another_protocol_is_played_and_noted(capsys, tmp_path):
     assert cli.run(evaluate.evaluate, [*words, *protocol]) == 0
     found = json.loads((tmp_path / "score.json").read_text())
     assert found["lengths"] == [100, 100] and found["cut"] == 2 and found["protocol"] == protocol
-    assert "2 of them were cut at env.max_episode_steps" in capsys.readouterr().out
+    assert "2 of the games were cut at env.max_episode_steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

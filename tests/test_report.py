@@ -105,7 +105,7 @@ def test_the_file_that_is_not_readable_is_named(tmp_path, name):
     run = make_run(tmp_path, "run", words=["game=seek"], scores=[1.0])
     (run / name).unlink(missing_ok=True)
     (run / name).mkdir()
-    with pytest.raises(ConfigError, match=f"run: its {name} is not readable"):
+    with pytest.raises(ConfigError, match=f"run: its {name} is missing or damaged"):
         curves.read_run(run)
 
 

@@ -1,9 +1,9 @@
-"""JAX's coordination service in a process of its own; started by `foajax.launch.processes`, not by people.
+"""Runs JAX's coordination service in a process of its own, which `foajax.launch.processes` starts.
 
-JAX would run it inside process 0. Whoever loses the service is aborted by JAX at once, without a word of ours and
-with nothing saved: so it outlives process 0, as long as the others need to notice and to save.
+JAX would run it inside process 0. JAX aborts any process that loses the service, without a message and with nothing
+saved. So the service outlives process 0 until the others have noticed and saved.
 
-Imports nothing of JAX but the extension with the service, which takes a fraction of a second.
+Of JAX it imports only the extension with the service, which takes a fraction of a second.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from pathlib import Path
 
 from jaxlib import _jax
 
-READY = "ready"  # said when others can connect; anything else is why they cannot
+READY = "ready"  # printed when others can connect; anything else says why they cannot
 _LINGER = 30.0  # seconds after the end of process 0
 _PAUSE = 0.2
 _ESTABLISHED = "01"  # the kernel's name for a connection that is up
 
 
 def main(arguments: str) -> None:
-    """Serves until stdin says something and ends, or just ends, as it does with process 0, and the others have gone.
+    """Serves until process 0 writes to stdin and closes it. If process 0 dies instead, waits for the others to end.
 
-    `arguments` are those that JAX makes the service with, as JSON: a list and a mapping.
+    `arguments` are those of JAX's service, as JSON: a list and a mapping.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):  # meant for the run, which needs the service to stop
         signal.signal(number, signal.SIG_IGN)
@@ -48,7 +48,7 @@ def main(arguments: str) -> None:
 
 
 def _wait_for(port: int) -> None:
-    """Until nobody listens at a port: the service of a job that was lost may linger, and gRPC would share it."""
+    """Waits until nobody listens at a port: a lost job's service may linger there, and gRPC would share the port."""
     end = time.monotonic() + _LINGER + 5.0
     while True:
         try:

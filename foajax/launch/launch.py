@@ -49,12 +49,11 @@ _FLAGS = (
 def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None] = lambda config: None) -> int:
     """Runs `task` on the config that the command line describes; returns the exit code.
 
-    A single run is composed and started directly. `--multirun` alone runs a sweep on this machine, a process of
-    `foajax.train` each, `--jobs=N` at a time (1). With a `hydra/launcher` (`submitit_slurm`; `basic` for one after
-    another in this process) Hydra starts `task` for each run, and other flags (`--cfg`) are Hydra's. Every run of a
-    sweep is checked, by `check` too, before the first one starts; one that fails does not end the sweep.
-
-    A `ConfigError`, one that `task` raises included, becomes one line on stderr and exit code 2.
+    A single run is composed and started directly. `--multirun` runs a sweep on this machine, a process of
+    `foajax.train` per run, `--jobs=N` of them at a time, else one. With a `hydra/launcher`, Hydra starts `task` for
+    each run: `submitit_slurm` on a cluster, `basic` one after another in this process. Other flags, such as `--cfg`,
+    are Hydra's. Every run of a sweep is composed and passed to `check` before the first one starts. A run that fails
+    does not end the sweep. A `ConfigError`, also from `task`, becomes one line on stderr and exit code 2.
     """
     if not {"-h", "--help"}.isdisjoint(arguments):
         return cli.run(lambda words: print(_help(_take_directory(words)[0])), arguments)
@@ -83,10 +82,10 @@ def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) 
     if is_sweep and not set(rest) - {*_MULTIRUN, *jobs}:
         return sweep.run_all(runs, jobs=at_a_time, command=(*sweep.COMMAND, *flag))
     if jobs:
-        raise refuse(jobs[0], accepted="the same with --multirun, and without a hydra/launcher")
+        raise refuse(jobs[0], accepted=f"{jobs[0]} --multirun, without other flags and without hydra/launcher")
     failures: dict[str, str] = {}
     swept = sweep.swept_by(ours) if is_sweep else None
-    theirs = [word for word in rest if word.startswith(("hydra.", "hydra/"))]  # after flags: its parser wants it so
+    theirs = [word for word in rest if word.startswith(("hydra.", "hydra/"))]  # Hydra's parser wants them after flags
     words = [*theirs, *(checked(word, sweep=True, config_dir=directory) for word in ours)]
     flags = [word for word in rest if word not in theirs]
     code = _run_hydra(lambda node: _job(task, swept, failures, node), [*flags, *flag, *words])
@@ -94,21 +93,22 @@ def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) 
 
 
 def _take_directory(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """The directory of `--config-dir`, where choices of one's own are, and the other words."""
+    """Separates the directory of `--config-dir`, which holds the user's own choices, from the other words."""
     words = list(arguments)
     for i, word in enumerate(words):
         flag, is_joined, value = word.partition("=")
         if flag in ("--config-dir", "-cd"):
             end = i + (1 if is_joined else 2)
-            directory = Path(value if is_joined else "".join(words[i + 1 : end])).absolute()
+            given = value if is_joined else "".join(words[i + 1 : end])
+            directory = Path(given).absolute()
             if not directory.is_dir() or end > len(words):
-                raise refuse(f"{flag}={value}", accepted="a directory with experiment/, sensor/, network/, learner/")
+                raise refuse(flag, given, "a directory with experiment/, sensor/, network/ or learner/")
             return directory, words[:i] + words[end:]
     return None, words
 
 
 def _check_flags(arguments: Sequence[str]) -> None:
-    """`ConfigError` where a word begins with a dash and is no flag of ours, nor one of Hydra's that make sense here."""
+    """Raises `ConfigError` for a word with a dash that is neither a flag of ours nor a flag of Hydra's for a run."""
     for i, word in enumerate(arguments):
         flag, is_joined, value = word.partition("=")
         if flag.startswith("-") and flag not in _FLAGS:
@@ -139,12 +139,12 @@ def _help(directory: Path | None) -> str:
 def _jobs(word: str = "--jobs=1", *more: str) -> int:
     number = word.partition("=")[2]
     if more or not number.isdecimal() or int(number) < 1:
-        raise refuse(one_line(word, *more), accepted="--jobs=N, how many runs at a time")
+        raise refuse(one_line(word, *more), accepted="one --jobs=N, the number of runs at a time, an integer >= 1")
     return int(number)
 
 
 def _job(task: Task, swept: Mapping[str, str] | None, failures: dict[str, str], node: Any) -> None:
-    """One run that Hydra starts, maybe in another process; `swept` are the keys of a sweep."""
+    """Runs `task` for Hydra, maybe in another process. `swept`: the keys of a sweep; None for a single run."""
     from hydra.core.hydra_config import HydraConfig
 
     words = HydraConfig.get().overrides.task

@@ -1,13 +1,13 @@
-"""The processes that share one run: how they find each other, what they tell each other, how they end.
+"""Lets several processes share one run: they find each other, exchange data, and end together.
 
-One process is the ordinary case: nothing here then talks to anybody. Several each step their own environments and
-take part in one update over all devices. Process 0 alone reads and writes the run's directory; what it read the
-others get from it, so that no shared file system is needed.
+With one process, which is the ordinary case, nothing here talks to anybody. Several processes each step their own
+environments and take part in one update over all devices. Process 0 alone reads and writes the run's directory and
+sends the others what it read, so that no shared file system is needed.
 
-A process that dies or hangs leaves the others waiting in a collective. They are watched from a thread: where a
-process has waited for `distributed.timeout`, or a collective fails, process 0 writes what all had agreed on last as
-a checkpoint, everyone says why in one line and ends with exit code 75 (try again). Where process 0 is the one that
-died, another that sees the run's directory writes.
+A process that dies or hangs leaves the others waiting in a collective. So a thread watches each process. If that has
+waited for `distributed.timeout`, or a collective fails, process 0 writes the last state that all had reached as a
+checkpoint. Each process says why in one line and ends with exit code 75 (try again). If process 0 is the one that
+died, another process that sees the run's directory writes the checkpoint.
 """
 
 from __future__ import annotations
@@ -65,19 +65,19 @@ class Job:
         return self.index == 0
 
     def gather(self, tree: Any) -> Any:
-        """All processes' arrays, concatenated along their leading axis; on the host where there are several."""
+        """Concatenates the arrays of all processes along their leading axis; on the host if there are several."""
         if self.count == 1 or not jax.tree.leaves(tree):
             return tree
         return _by_data(_gather, tree)
 
     def share(self, tree: Any) -> Any:
-        """Process 0's arrays; the others' give the shapes."""
+        """Returns process 0's arrays in every process; the others' arrays give the shapes."""
         if self.count == 1:
             return tree
         return _by_data(multihost_utils.broadcast_one_to_all, tree)
 
     def mine(self, tree: Any) -> Any:
-        """The inverse of `gather`: this process's part of the leading axis."""
+        """Returns this process's part of the leading axis: the inverse of `gather`."""
         if self.count == 1:
             return tree
 
@@ -88,7 +88,7 @@ class Job:
         return jax.tree.map(part, tree)
 
     def tell(self, name: str, text: str) -> str:
-        """Process 0's `text`, in every process; each `name` once."""
+        """Returns process 0's `text` in every process. A `name` can be used once."""
         if self.count == 1:
             return text
         client: Any = jax._src.distributed.global_state.client  # no public way leads to it
@@ -97,7 +97,7 @@ class Job:
         return client.blocking_key_value_get(f"foajax/{name}", 1000 * _STARTING)
 
     def agree(self, config: Config) -> None:
-        """`ConfigError`, in every process, unless all have been started with the same configuration."""
+        """Raises `ConfigError` in every process, unless all were started with the same configuration."""
         if self.count == 1:
             return
         settings = {key: value for key, value in flatten(to_mapping(config)) if not key.startswith(_OWN)}
@@ -111,7 +111,7 @@ class Job:
             raise refuse(f"process {others[0]}", accepted="that of process 0", why="has another configuration")
 
     def by_first(self, name: str, task: Callable[[], T]) -> T | None:
-        """What process 0 gets from `task`, None in the others; its `ConfigError` is raised in all."""
+        """Runs `task` in process 0 and returns its result there, else None; raises its `ConfigError` everywhere."""
         result, problem = None, ""
         if self.is_first:
             try:
@@ -124,17 +124,17 @@ class Job:
 
 
 def start(config: Config) -> Job:
-    """Joins the other processes, if the configuration, the environment or SLURM tells of any.
+    """Joins the other processes, if the configuration, the environment or SLURM names any.
 
-    To be called before anything else uses JAX's devices. The environment's names are JAX_COORDINATOR_ADDRESS,
-    JAX's own, with JAX_NUM_PROCESSES and JAX_PROCESS_ID.
+    Call it before anything else uses JAX's devices. The environment names them by JAX_COORDINATOR_ADDRESS,
+    JAX_NUM_PROCESSES and JAX_PROCESS_ID.
 
     Raises:
       ConfigError: the others are not found, or the devices cannot share the environments.
     """
     others = where(config)
     if others is not None:
-        # Its handler of SIGTERM would replace ours, which saves.
+        # This service's handler of SIGTERM would replace ours, which saves.
         jax.config.update("jax_enable_preemption_service", False)
         keepalive = math.ceil(_KEEPALIVE * config.distributed.timeout)
         try:
@@ -143,17 +143,17 @@ def start(config: Config) -> Job:
                     **others, initialization_timeout=_STARTING, heartbeat_timeout_seconds=keepalive
                 )
         except (RuntimeError, ValueError) as error:
-            reason = one_line(error)[:200]
-            raise refuse("distributed", others, f"what all processes can reach ({reason})") from None
+            why = f"cannot be joined ({one_line(error)[:200]})"
+            raise refuse("distributed", others, "a coordinator that all processes can reach", why=why) from None
     return Job(config)
 
 
 class _Service:
-    """JAX's coordination service, which process 0 makes and ends, in a process that outlives it."""
+    """Runs JAX's coordination service for process 0, in a process that outlives it."""
 
     def __init__(self, *positional: Any, **named: Any) -> None:
         words = [sys.executable, "-P", coordinator.__file__, json.dumps([positional, named])]
-        # It may outlive this process, and then holds nothing that others wait for the end of.
+        # It may outlive this process, so it holds no stderr whose end others wait for.
         pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
         self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=nowhere, text=True)
         assert self._process.stdout is not None
@@ -166,7 +166,7 @@ class _Service:
 
 
 def where(config: Config) -> dict[str, Any] | None:
-    """What `jax.distributed.initialize` has to be told; None for a process that is alone."""
+    """Finds the arguments of `jax.distributed.initialize`; None for a process that is alone."""
     stated = config.distributed
     if stated.coordinator is not None:
         return {
@@ -183,7 +183,7 @@ def where(config: Config) -> dict[str, Any] | None:
             raise refuse("distributed", accepted=names) from None
         check_address("JAX_COORDINATOR_ADDRESS", os.environ["JAX_COORDINATOR_ADDRESS"])
         return {"num_processes": count, "process_id": index, "cluster_detection_method": "deactivate"}
-    # A step of one task is a run of its own, whatever the job around it holds.
+    # A SLURM step of one task is a run of its own, whatever else its job holds.
     if int(os.environ.get("SLURM_STEP_NUM_TASKS", "1")) > 1:
         local = {"local_device_ids": list(range(config.train.devices))} if config.train.devices > 1 else {}
         return {"cluster_detection_method": "slurm", **local}
@@ -199,7 +199,7 @@ def _local_devices(config: Config) -> list[jax.Device]:
 
 
 def _gather(leaves: list[np.ndarray]) -> list[np.ndarray]:
-    """Concatenates over processes, all arrays in one exchange: the cost of one is its delay, not its size."""
+    """Concatenates over processes. All arrays go in one exchange, as its delay costs more than its size."""
     blob = np.frombuffer(b"".join(leaf.tobytes() for leaf in leaves), np.uint8)
     parts = []
     for row in multihost_utils.process_allgather(blob):
@@ -210,7 +210,7 @@ def _gather(leaves: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _by_data(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Applies `function` to a tree's arrays, typed keys as their data."""
+    """Applies `function` to a tree's arrays; typed PRNG keys pass as their data."""
     leaves, structure = jax.tree.flatten(tree)
     keys = [jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in leaves]
     data = [jax.random.key_data(leaf) if is_key else leaf for leaf, is_key in zip(leaves, keys, strict=True)]
@@ -220,7 +220,7 @@ def _by_data(function: Callable[[Any], Any], tree: Any) -> Any:
 
 
 def leave(code: int) -> int:
-    """The exit code of a process that fails alone; one of several ends here, as an orderly end would wait for them."""
+    """Returns the exit code; with other processes, ends this one here, as an orderly end would wait for them."""
     if jax.process_count() > 1:
         sys.stdout.flush()
         sys.stderr.flush()
@@ -229,12 +229,12 @@ def leave(code: int) -> int:
 
 
 class Watch:
-    """Ends a process that waits for others in vain.
+    """Ends this process if it waits for others in vain.
 
     Args:
-      job: where there is one process only, nothing is watched.
+      job: the processes; a single one is not watched.
       timeout: seconds.
-      rescue: writes what can be saved and says where it left the run; called at most once, from any thread.
+      rescue: saves what it can and returns words about it; called at most once, from any thread.
     """
 
     def __init__(self, job: Job, timeout: float, rescue: Callable[[], str]) -> None:
@@ -245,20 +245,20 @@ class Watch:
             threading.Thread(target=self._watch, name="watch", daemon=True).start()
 
     def beat(self) -> None:
-        """A sign of life; from the first one on, each has to come within the timeout after the one before."""
+        """Gives a sign of life. From the first one on, the next is due within the timeout."""
         self._beat = time.monotonic()
 
     def rest(self) -> None:
-        """No further sign of life is due."""
+        """Ends the watch until the next sign of life."""
         self._beat = None
 
     @contextlib.contextmanager
     def expecting_others(self):
-        """Turns a collective's failure, as when another process dies, into the end of this one."""
+        """Ends this process if a collective fails, as it does when another process dies."""
         try:
             yield
         except (jax.errors.JaxRuntimeError, ValueError) as error:
-            # Gloo's failures come as either, depending on the call that they come up in.
+            # Gloo's failures come as either, depending on the call.
             if self._job.count == 1 or (isinstance(error, ValueError) and "Gloo" not in str(error)):
                 raise
             self._end(one_line(error)[:160])

@@ -1,4 +1,4 @@
-"""Requests to stop, which come as signals."""
+"""Turns signals into requests to stop."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)  # the last one is a clu
 
 
 def signal_in(numbers: bytes) -> str:
-    """The first request to stop among the numbers of signals, if any."""
+    """Returns the name of the first request to stop among numbers of signals, or an empty text."""
     names = [signal.Signals(number).name for number in numbers if number in STOPS]
     return names[0] if names else ""
 
@@ -25,10 +25,10 @@ def arrive_here() -> bool:
 
 @contextlib.contextmanager
 def interrupt_ends() -> Iterator[None]:
-    """SIGINT ends the process outright, as SIGTERM does, until a `StopRequest` takes it over.
+    """Makes SIGINT end the process outright, as SIGTERM does, until a `StopRequest` takes it over.
 
-    Python raises KeyboardInterrupt instead, which is lost where it comes inside a callback, such as JAX's at a garbage
-    collection. A handler of one's own, and a SIGINT that is ignored, stay.
+    Python would raise KeyboardInterrupt, which is lost inside a callback, such as JAX's at a garbage collection.
+    If SIGINT is ignored or has another handler than Python's, nothing changes.
     """
     before = signal.getsignal(signal.SIGINT)
     if not arrive_here() or before is not signal.default_int_handler:
@@ -44,7 +44,7 @@ def interrupt_ends() -> Iterator[None]:
 class StopRequest:
     """Turns SIGINT, SIGTERM and SIGUSR1 (a cluster's preemption) into a flag; a second SIGINT interrupts at once.
 
-    In another thread than the main one it hears of none. The handlers from before are back after a `with`.
+    Outside the main thread it hears of no signal. After its `with`, the former handlers are back.
     """
 
     def __init__(self) -> None:

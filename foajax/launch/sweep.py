@@ -1,7 +1,7 @@
-"""The runs of a sweep on this machine: a process each, some at a time, so that none can take another down.
+"""Runs a sweep on this machine: a process per run, some at a time, so that none can take another down.
 
-What is finished is skipped, what is unfinished goes on, what fails is listed in the end and the others are run
-nevertheless. A signal goes on to the running processes, which save; no further one is started.
+Finished runs are skipped and unfinished ones go on. A run that fails is listed at the end and does not stop the others.
+A signal is passed on to the running processes, which save, and no further one is started.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class _Stop:
         self.processes: dict[str, subprocess.Popen] = {}  # by run directory
 
     def add(self, directory: str, process: subprocess.Popen) -> None:
-        """A process that has been started; what came meanwhile is passed on to it."""
+        """Adds a process that has been started; passes on to it a signal that came meanwhile."""
         self.processes[directory] = process
         if self.requested is not None:
             process.send_signal(self.requested)
@@ -69,14 +69,14 @@ class _Stop:
 
 
 def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = COMMAND) -> int:
-    """Runs `command` with each run's words, `jobs` at a time; 0 unless one failed.
+    """Runs `command` with each run's words, `jobs` at a time; returns 1 if one failed, else 0.
 
-    One at a time, a run has the terminal and the machine; beside others it writes to ``output.txt`` in its directory
-    and has its share of the processor's cores.
+    With `jobs=1` a run has the terminal and all cores. Else it writes to `output.txt` in its directory and has its
+    share of the cores.
     """
     waiting = deque(run for run in runs if not skip_if_finished(run.config))
     failures: dict[str, str] = {}
-    shares = deque(shares_of_cores(min(jobs, len(waiting) or 1)))  # few runs are not to leave cores idle
+    shares = deque(shares_of_cores(min(jobs, len(waiting) or 1)))  # few runs leave no core idle
     taken: dict[str, set[int]] = {}  # by run directory
     stop = _Stop()
     with stop.listening():
@@ -97,7 +97,7 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = COMMAND)
                 if (code := process.poll()) is not None:
                     del stop.processes[directory]
                     shares.append(taken.pop(directory))
-                    # Whoever is told to stop before it can save is not at fault.
+                    # A run that was stopped before it could save has not failed.
                     if code and not (stop.requested and -code in STOPS):
                         ended = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit {code}"
                         failures[directory] = ended if jobs == 1 else f"{ended} (see {_OUTPUT} there)"
@@ -105,9 +105,9 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = COMMAND)
 
 
 def shares_of_cores(jobs: int) -> list[set[int]]:
-    """Which of this process's cores each of `jobs` runs has, as equal as can be; empty sets where a system cannot say.
+    """Divides this process's cores among `jobs` runs as evenly as possible; empty sets where a system cannot.
 
-    A run on its own cores does not wait at every small product for threads that another run keeps from starting.
+    On shared cores a run would wait at every small product for threads that another run keeps from starting.
     """
     if not hasattr(os, "sched_getaffinity"):
         return [set() for _ in range(jobs)]
@@ -116,7 +116,7 @@ def shares_of_cores(jobs: int) -> list[set[int]]:
 
 
 def skip_if_finished(config: Config) -> bool:
-    """Whether there is nothing left to do for a run, which is said."""
+    """Returns whether a run is finished, and if so prints it."""
     if is_finished(config):
         _say(f"{config.run_dir}: finished already")
         return True
@@ -124,9 +124,9 @@ def skip_if_finished(config: Config) -> bool:
 
 
 def summarise(configs: Sequence[Config], failures: Mapping[str, str]) -> int:
-    """Lists what failed and what is not finished; 1 where something failed, else 0.
+    """Prints which runs failed and which are not finished; returns 1 if one failed, else 0.
 
-    `failures` has what is known about some run directories beside what they say themselves.
+    `failures` has reasons by run directory, besides those that the directories hold.
     """
     lines, failed = [], 0
     for config in configs:
@@ -145,7 +145,7 @@ def summarise(configs: Sequence[Config], failures: Mapping[str, str]) -> int:
 
 @contextlib.contextmanager
 def _on(cores: set[int]) -> Iterator[None]:
-    """What starts meanwhile runs on these cores."""
+    """Makes processes that are started meanwhile run on these cores."""
     if not cores:
         yield
         return
@@ -158,7 +158,7 @@ def _on(cores: set[int]) -> Iterator[None]:
 
 
 def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen:
-    # In a process group of its own: the terminal's Ctrl-C comes once, from us.
+    # In a process group of its own, so that the terminal's Ctrl-C reaches it only through us.
     forget_failure(Path(run.config.run_dir))
     words = [*command, *run.words]
     if alone:
@@ -176,7 +176,7 @@ def _say(text: str) -> None:
 
 
 def expand(words: Sequence[str], config_dir: Path | None = None) -> list[Run]:
-    """Every run of a sweep, checked, so that a mistake in the last one does not show hours later."""
+    """Composes and checks every run of a sweep, so that a mistake in the last one does not show hours later."""
     swept = swept_by(words)
     runs: dict[str, Run] = {}
     for overrides in itertools.product(*(_values(word, config_dir) for word in words)):
@@ -191,13 +191,13 @@ def expand(words: Sequence[str], config_dir: Path | None = None) -> list[Run]:
 
 
 def swept_by(words: Sequence[str]) -> dict[str, str]:
-    """The keys of which a sweep tries several values, as they were typed, by those words and by today's."""
+    """Finds the keys that a sweep varies. Each is listed as it was typed and, if it was renamed, by its new name."""
     typed = [override.key_or_group for override in map(parse_override, words) if override.is_sweep_override()]
     return {**{key: key for key in typed}, **{RENAMED[key]: key for key in typed if key in RENAMED}}
 
 
 def named(config: Config, overrides: Iterable[str], swept: Mapping[str, str]) -> Config:
-    """`config` with a name that tells what the sweep chose, unless the choices name the directory already."""
+    """Adds what the sweep chose to the run's name, except for what names the directory anyway."""
     known = {"experiment", "game", "seed", "name", "run"}
     parsed = {override.key_or_group: override for override in map(parse_override, overrides)}
     if {"name", "run"} & parsed.keys():
@@ -207,7 +207,7 @@ def named(config: Config, overrides: Iterable[str], swept: Mapping[str, str]) ->
 
 
 def _values(word: str, config_dir: Path | None) -> Iterable[str]:
-    """The single overrides that one override of a sweep stands for."""
+    """Splits an override of a sweep into the single ones that it stands for."""
     from hydra.core.override_parser.types import Glob
 
     override = parse_override(word)

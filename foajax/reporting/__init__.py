@@ -1,1 +1,1 @@
-"""Scores, curves and costs of runs, and the report of them."""
+"""Compares runs: scores, curves, costs, the report, and runs that are kept."""

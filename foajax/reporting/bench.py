@@ -1,4 +1,4 @@
-"""Measurements that are kept in `results/bench/`: how a file is written, and the table of all."""
+"""Writes measurements, and the table of those that are kept in `results/bench/`."""
 
 from __future__ import annotations
 
@@ -24,17 +24,16 @@ Each file has its command, commit, machine and date, and under `results` what th
 
 
 class Options(Section):
-    """What every benchmark takes."""
+    """The keys of every benchmark."""
 
     out: str | None = Field(None, description="File for the result.")
 
     def check(self) -> None:
-        """`ConfigError` where the file cannot be written."""
         cli.check_file("out", self.out)
 
 
 def write(key: str, path: str, results: Any, command: Sequence[str]) -> None:
-    """Writes what `command` has found, with all that is needed to judge and repeat it."""
+    """Writes what `command` has found, with the command, commit, date and machine."""
     found = {
         "command": shlex.join(command),
         "commit": commit(),
@@ -46,7 +45,7 @@ def write(key: str, path: str, results: Any, command: Sequence[str]) -> None:
 
 
 def write_table(directory: Path = BENCH) -> None:
-    """Makes the table of all measurements anew."""
+    """Writes the table of all kept measurements."""
     rows = []
     for file in sorted(directory.glob("*.json")):
         found = json.loads(file.read_text())

@@ -39,7 +39,7 @@ RULES = f"""\
 
 
 class Game(NamedTuple):
-    """What is kept of one game, by the experiment's name without `_packed`."""
+    """The kept runs of one game, by the experiment's name without `_packed`."""
 
     name: str
     runs: Mapping[str, Sequence[RunData]]  # seeds of each
@@ -55,7 +55,7 @@ class Part(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """What is claimed; it holds where all parts lie between `low` and `high`."""
+    """A claim, which holds if all its parts lie between `low` and `high`."""
 
     title: str
     says: str | None  # the paper's words; None where the question is ours
@@ -66,20 +66,20 @@ class Claim(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """What the runs of one game say of a claim."""
+    """The verdict of one game's runs on a claim."""
 
     verdict: str
     seen: list[str]
 
 
 def ask(claim: Claim, game: Game) -> Finding:
-    """What the runs of a game say of a claim."""
+    """Tests a claim on the runs of a game."""
     parts = claim.parts(game)
     return Finding(judge(parts, claim.low, claim.high), [part.seen for part in parts if part is not None])
 
 
 def judge(parts: Sequence[Part | None], low: float, high: float) -> str:
-    """The verdict; see `RULES`."""
+    """Reaches the verdict by `RULES`."""
     there = [part for part in parts if part is not None]
     if len(there) < len(parts):
         return NOT_RUN
@@ -93,36 +93,37 @@ def judge(parts: Sequence[Part | None], low: float, high: float) -> str:
 
 
 def score(runs: Sequence[RunData]) -> Interval:
-    """The mean score over seeds; its interval is over the games where there is one seed."""
+    """Averages the scores over seeds. With one seed, the interval is over its games."""
     if len(runs) == 1:
         return interval([np.array((runs[0].evaluation or {})["returns"], float)], np.mean)
     return interval([np.array([run.final_score for run in runs])], np.mean)
 
 
 def training_score(runs: Sequence[RunData], *, share: float) -> Interval:
-    """The mean of the curves over the first `share` of the training, over seeds."""
+    """Averages the curves over the first `share` of the training and over seeds."""
     steps = [np.linspace(0, share * run.env_steps[-1], 300) for run in runs]
     means = [np.interp(x, run.env_steps, run.score).mean() for x, run in zip(steps, runs, strict=True)]
     return interval([np.array(means)], np.mean)
 
 
 def above_chance(score: Interval, game: str) -> Interval:
-    """What a score has above random play; all of it in a game without a reference."""
+    """Subtracts the score of random play, 0 in a game without a reference."""
     chance = REFERENCE.get(game, (0.0, 0.0))[0]
     return Interval(*(each - chance for each in score))
 
 
 def over(a: Interval, b: Interval) -> Interval:
-    """a / b of what is not negative; from the smallest to the largest ratio."""
+    """Divides a by b, negative values counted as 0; the interval goes from the smallest to the largest ratio."""
     a, b = (Interval(*(max(each, 0.0) for each in given)) for given in (a, b))
     value, high = (x / y if y > 0 else math.inf for x, y in ((a.value, b.value), (a.high, b.low)))
     return Interval(value, a.low / b.high if b.high > 0 else 0.0, high)
 
 
 def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) -> Interval | None:
-    """How many times as far along the axis `slow` first has the score that both reach: the lower one at the ends.
+    """Divides where `slow` first reaches a score, along the axis, by where `fast` does: the lower of their last scores.
 
-    Of mean curves over seeds; the interval is by bootstrap over both. None where a group has no scores in common.
+    Curves are means over seeds, and the interval is by bootstrap over both groups. None if the curves of a group do not
+    overlap.
     """
     first, second = on_common_axis(slow, axis), on_common_axis(fast, axis)
     if first is None or second is None:
@@ -143,7 +144,7 @@ def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) ->
 def _compare(
     measure: Callable[[Sequence[RunData]], Interval], what: str, pairs: Sequence[tuple[str, str]], game: Game
 ) -> list[Part | None]:
-    """A measure of one experiment over that of another, above random play, pair by pair."""
+    """Divides a measure of one experiment by that of another, both less random play, pair by pair."""
     parts: list[Part | None] = []
     for pair in pairs:
         if not all(name in game.runs for name in pair):
@@ -180,7 +181,7 @@ def _longer(slow: str, fast: str) -> Callable[[Game], list[Part | None]]:
 
 
 def _gaze(number: str, what: str) -> Callable[[Game], list[Part | None]]:
-    """A number of the heat maps of the two sensors of the paper's Fig. 10."""
+    """Takes a number from the heat maps of the two sensors of the paper's Fig. 10."""
 
     def part(name: str, heats: Sequence[HeatMap]) -> Part | None:
         if not heats:

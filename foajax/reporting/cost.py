@@ -1,4 +1,4 @@
-"""What a decision costs: counted by XLA before it compiles, and timed in turns; `foajax.cost` says what is counted."""
+"""Measures what a decision costs: FLOPs as XLA counts them, and times, taken in turns; see `foajax.cost`."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ class Subject(NamedTuple):
 
 
 def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repeats: int) -> list[dict[str, Any]]:
-    """One record an experiment: what is counted, times in microseconds, ratios to `nonfoa`.
-
-    `nonfoa` is measured in any case, for the ratios.
+    """Measures each experiment, and `nonfoa` for the ratios: counts, times in microseconds, ratios to `nonfoa`.
 
     Raises:
       ConfigError: an unknown name.
@@ -55,7 +53,7 @@ def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repe
 
 
 def measure_decisions(configs: Sequence[Config], *, repeats: int) -> list[dict[str, Any]]:
-    """For each run what is counted and, timed on this machine, `decision_us_batch1`."""
+    """Counts each run's decision, and times it on this machine as `decision_us_batch1`."""
     subjects, key = [_subject(config) for config in configs], "decision_us_batch1"
     times = medians([{key: subject.calls[key]} for subject in subjects], repeats)
     return [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
@@ -69,7 +67,7 @@ def decide(
     core_state: Carry,
     key: PRNGKeyArray,
 ) -> tuple[Array, Array, Carry]:
-    """The network's part: torso to sampling, and the gaze's move."""
+    """Makes the network's part of a decision: torso to sampling, and the gaze's move."""
     batch = focal_point.shape[0]
     natural_key, vision_key = jax.random.split(key, (2, batch))
     images, is_first = [image[None] for image in roi], jnp.zeros(batch, bool)
@@ -90,30 +88,30 @@ def decision(
     core_state: Carry,
     key: PRNGKeyArray,
 ) -> tuple[Array, Array, Carry]:
-    """Both parts as one program."""
+    """Makes a decision: senses, then does the network's part."""
     return decide(agent, params, agent.sense(frame, focal_point), focal_point, core_state, key)
 
 
 def torso(agent: Agent, params: Params, roi: tuple[Float[Array, "B _ _ _"], ...]) -> list[Array]:
-    """The convolutions alone, of every image that is large enough for them."""
+    """Runs only the torso, on every image that is large enough for it."""
     module: Any = make_torso(agent.config.network)
     weights = {i: params["params"].get(f"torso_{i}") for i in range(len(roi))}
     return [module.apply({"params": own}, roi[i]) for i, own in weights.items() if own is not None]
 
 
 def flops(function: Callable[..., Any], *arguments: Any) -> int:
-    """Floating-point operations of a call, as XLA counts them before it compiles."""
+    """Counts the floating-point operations of a call, as XLA does before it compiles."""
     analysis: Any = jax.jit(function).lower(*arguments).cost_analysis()
     return int(analysis["flops"])
 
 
 def count(config: Config) -> dict[str, Any]:
-    """What is counted of a run's decision: the same on every machine."""
+    """Counts what a run's decision takes; the same on every machine."""
     return _count(*_of_shapes(config))
 
 
 def _of_shapes(config: Config) -> tuple[Agent, Params]:
-    """An agent, and the shapes of its parameters in their place."""
+    """Makes an agent, with shapes in the place of its parameters."""
     agent = Agent(config, num_actions=_NUM_ACTIONS, crop_top=None)
     return agent, jax.eval_shape(agent.initial_params, jax.random.key(0))
 
@@ -121,7 +119,7 @@ def _of_shapes(config: Config) -> tuple[Agent, Params]:
 def _subject(config: Config) -> Subject:
     agent, shapes = _of_shapes(config)
     random = np.random.default_rng(0)
-    # The values matter to neither count nor time; initialisation as in training is slow to compile.
+    # The values affect neither count nor time; initialisation as in training is slow to compile.
     params = jax.tree.map(lambda s: jnp.asarray(random.normal(0, 0.05, s.shape), s.dtype), shapes)
     calls = {}
     for batch in BATCHES:
@@ -131,7 +129,7 @@ def _subject(config: Config) -> Subject:
 
 
 def _count(agent: Agent, params: Params) -> dict[str, Any]:
-    """What is the same on every machine, at batch 1."""
+    """Counts what is the same on every machine, at batch 1."""
     config = agent.config
     frame, focal_point, core_state, key = _inputs(agent, 1)
     roi = jax.eval_shape(agent.sense, frame, focal_point)
@@ -149,7 +147,7 @@ def _count(agent: Agent, params: Params) -> dict[str, Any]:
 
 
 def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, Carry, Array]:
-    """A batch of frames of noise, the focal points at their centres."""
+    """Makes a batch of noise frames, with the focal points at their centres."""
     shape, pixel = agent.config.env.frame_shape, agent.config.env.pixel_shape
     frame = jnp.asarray(np.random.default_rng(0).normal(size=(batch, *shape, *pixel)), jnp.float32)
     focal_point = jnp.tile(jnp.array(shape, jnp.int32) // 2, (batch, 1))
@@ -157,7 +155,7 @@ def _inputs(agent: Agent, batch: int) -> tuple[Array, Array, Carry, Array]:
 
 
 def _calls(agent: Agent, params: Params, batch: int) -> list[Callable[[], Any]]:
-    """What is timed: sensor, network, and both as one program."""
+    """Compiles what is timed: sensor, network, and both as one program."""
     frame, focal_point, core_state, key = _inputs(agent, batch)
     look = jax.jit(agent.sense)
     think, both = (jax.jit(functools.partial(part, agent)) for part in (decide, decision))
@@ -170,15 +168,15 @@ def _calls(agent: Agent, params: Params, batch: int) -> list[Callable[[], Any]]:
 
 
 def medians(calls: Sequence[Calls], repeats: int) -> list[dict[str, float]]:
-    """Median duration of each call in microseconds, as `take_turns` times them."""
+    """Returns the median duration of each call, in microseconds, timed by `take_turns`."""
     taken = take_turns(calls, repeats)
     return [{name: statistics.median(values) for name, values in times.items()} for times in taken]
 
 
 def take_turns(calls: Sequence[Calls], repeats: int) -> list[dict[str, list[float]]]:
-    """Durations in microseconds; the calls take turns, each after one of its own that is not timed.
+    """Times calls in turns; returns microseconds. Before each timed call, the same call runs once untimed.
 
-    A robot's loop decides again and again: the caches then hold the parameters and the threads are awake.
+    So caches hold the parameters and threads are awake, as in a robot's loop, which decides again and again.
     """
     taken: list[dict[str, list[float]]] = [{name: [] for name in group} for group in calls]
     for _ in range(repeats):

@@ -1,4 +1,4 @@
-"""Learning curves and final scores of runs, as figures."""
+"""Draws learning curves and final scores of runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from foajax.runs.directory import load_config
 from foajax.runs.rows import parse_row
 from foajax.viewing.style import STYLE
 
-SENSORS = {  # a colour each, the same in every figure; the pairs with and without a periphery are of one hue
+SENSORS = {  # colours, the same in every figure; a sensor with and without a periphery has one hue
     "nonfoa": "#444444",
     "constant50_sub1": "#009e73",
     "constant50_sub2": "#cc79a7",
@@ -45,14 +45,14 @@ PAPER_NAMES = {
     "decreasing_p": "Decreasing(P) 30-50-70",
 }
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
-_LINES = ("-", "--", ":", "-.")  # of those who share a colour
+_LINES = ("-", "--", ":", "-.")  # tell lines of one colour apart
 _POINTS = 300  # of a curve
 AXES = {"env_steps": (1e6, "million agent steps"), "time": (3600.0, "hours of training")}
 _LABEL_GAP = 0.085  # between labels at the lines' ends, of the axis's height
 
 
 class RunData(NamedTuple):
-    """What a run's directory says about it."""
+    """What a run's directory says about the run."""
 
     path: Path
     config: Config
@@ -63,12 +63,12 @@ class RunData(NamedTuple):
 
     @property
     def final_score(self) -> float:
-        """Evaluated where it was, else of the last games of training."""
+        """The evaluated score or, without an evaluation, that of the last games of training."""
         return float(self.evaluation["mean"] if self.evaluation else self.score[-1])
 
 
 class Band(NamedTuple):
-    """A mean over seeds along an axis, with its interval."""
+    """The mean over seeds along an axis, and its interval."""
 
     x: Float[np.ndarray, "m"]
     mean: Float[np.ndarray, "m"]
@@ -80,7 +80,7 @@ def read_run(path: str | Path, *, trust: bool = False) -> RunData:
     """Reads a run's directory.
 
     Raises:
-      ConfigError: it is none, no game has ended in it yet, or it names code and `trust` is not given.
+      ConfigError: it is no run's directory, no game has ended yet, or it names code and `trust` is false.
     """
     path = Path(path)
     config = load_config(path)
@@ -93,7 +93,7 @@ def read_run(path: str | Path, *, trust: bool = False) -> RunData:
         if evaluation is not None:
             float(evaluation["mean"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise refuse("run", path, "", why=f"its {file.name} is not readable") from None
+        raise refuse("run", path, "the directory of a run", why=f"its {file.name} is missing or damaged") from None
     if not rows:
         raise refuse("run", path, "a run with scores", why="no game has ended in it yet")
     env_steps, time, score = (np.array([row[key] for row in rows], float) for key in ("env_steps", "time", "score"))
@@ -103,7 +103,7 @@ def read_run(path: str | Path, *, trust: bool = False) -> RunData:
 def on_common_axis(
     runs: Sequence[RunData], axis: str
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "n m"]] | None:
-    """The runs' scores at the same places of an axis, where all have scores; None where that is nowhere."""
+    """Interpolates the runs' scores at the same places of an axis, where all have scores; None if they share none."""
     xs = [getattr(run, axis) for run in runs]
     first, last = max(each[0] for each in xs), min(each[-1] for each in xs)
     if first >= last:
@@ -113,7 +113,7 @@ def on_common_axis(
 
 
 def band(runs: Sequence[RunData], axis: str) -> Band | None:
-    """The mean curve over seeds where all have scores, with a bootstrap interval; None where that is nowhere."""
+    """Averages curves over seeds where all have scores, with a bootstrap interval; None if they share no place."""
     common = on_common_axis(runs, axis)
     if common is None:
         return None
@@ -124,13 +124,13 @@ def band(runs: Sequence[RunData], axis: str) -> Band | None:
 
 
 def sensor_of(name: str) -> str:
-    """The sensor that an experiment is named after: `constant70_p` of `constant70_p_packed-frozen`."""
+    """Returns the sensor that an experiment is named after: `constant70_p` for `constant70_p_packed-frozen`."""
     papers = {paper: sensor for sensor, paper in PAPER_NAMES.items()}
     return papers.get(name.removesuffix(", packed")) or re.split(r"\W", name)[0].removesuffix("_packed")
 
 
 def colours_of(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each name: its sensor's where that has one, else one that no sensor among them has."""
+    """Chooses a colour per name: its sensor's or, if that has none, one that no other sensor here has."""
     colours = {name: SENSORS.get(sensor_of(name)) for name in names}
     free = itertools.cycle([colour for colour in _COLOURS if colour not in colours.values()] or _COLOURS)
     return {name: colour or next(free) for name, colour in colours.items()}
@@ -142,7 +142,7 @@ def draw_curves(
     colours: Mapping[str, str],
     axes: Mapping[str, tuple[float, str]] = AXES,
 ) -> Figure:
-    """Score against steps and against time; a line for each group of seeds, named at its end, every seed thin."""
+    """Draws scores against steps and against time: a line per group, named at its end, and a thin line per seed."""
     shared = list(colours.values())
     lines = {name: _LINES[shared[:i].count(colours[name]) % len(_LINES)] for i, name in enumerate(colours)}
     with rc_context(STYLE | {"font.size": 12, "axes.titlesize": 12}):
@@ -178,7 +178,7 @@ def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, line
 
 
 def _name_lines(plot: Any, ends: Mapping[str, float], colours: Mapping[str, str]) -> None:
-    """Writes each line's name to the right of the plot, at the height of its end or as near as there is room."""
+    """Writes each line's name to the right of the plot, as near to the height of its end as there is room."""
     low, high = plot.get_ylim()
     for name, height in zip(ends, spread(list(ends.values()), _LABEL_GAP * (high - low)), strict=True):
         place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "annotation_clip": False}
@@ -186,7 +186,7 @@ def _name_lines(plot: Any, ends: Mapping[str, float], colours: Mapping[str, str]
 
 
 def spread(wanted: Sequence[float], gap: float) -> list[float]:
-    """Places in the order of those `wanted` and at least `gap` apart, as near to them as can be."""
+    """Moves places at least `gap` apart, as near to those `wanted` as possible and in the same order."""
     order, gaps = np.argsort(wanted, kind="stable"), gap * np.arange(len(wanted))
     placed = np.empty(len(order))
     placed[order] = isotonic_regression(np.asarray(wanted, float)[order] - gaps).x + gaps
@@ -194,11 +194,11 @@ def spread(wanted: Sequence[float], gap: float) -> list[float]:
 
 
 def draw_scores(intervals: Mapping[str, Mapping[str, Interval]], colours: Mapping[str, str]) -> Figure:
-    """Interquartile means with their intervals: a panel for each game, a row for each group.
+    """Draws interquartile means and their intervals: a panel per game, a row per group.
 
     Args:
-      intervals: of each group, by the panel's title.
-      colours: of the groups.
+      intervals: by the panel's title and the group's name.
+      colours: by the group's name.
     """
     names = list(dict.fromkeys(name for panel in intervals.values() for name in panel))
     with rc_context(STYLE):
@@ -224,7 +224,7 @@ def draw_scores(intervals: Mapping[str, Mapping[str, Interval]], colours: Mappin
 
 
 def save(figure: Figure, file: Path) -> None:
-    """Writes a figure as a PNG of 128 colours, a third of the size."""
+    """Writes a figure as a PNG of 128 colours, which takes a third of the size."""
     content = io.BytesIO()
     figure.savefig(content, dpi=120)
     Image.open(content).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)

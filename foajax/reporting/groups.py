@@ -1,4 +1,4 @@
-"""Groups runs by game and experiment into seeds; says how groups differ and what they score."""
+"""Groups runs by game and experiment; says how the groups differ and what they score."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Groups = dict[str, list[RunData]]  # seeds of the same experiment, by the experi
 
 
 def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
-    """The runs by game and experiment; of a preset in the paper's order and by the paper's names.
+    """Groups runs by game and experiment; those of a preset by the paper's names and in its order.
 
     Raises:
-      ConfigError: no run is left; runs that are not of the same kind share a name.
+      ConfigError: no run is left; runs of one game and name differ in more than their seeds.
     """
     games: dict[str, Groups] = {}
     for run in runs:
@@ -40,7 +40,7 @@ def games_of(runs: Iterable[RunData], preset: str | None) -> dict[str, Groups]:
             if differences := differing_keys(seeds):
                 key, values = next(iter(differences.items()))
                 other = next(run for run, value in zip(seeds, values, strict=True) if value != values[0])
-                accepted = "a set of runs that differ in their seeds alone, or in their names"
+                accepted = "runs that differ in nothing but their seeds, or have different names"
                 why = f"{name} differs in {key} from that of {seeds[0].path}"
                 raise refuse(str(other.path), accepted=accepted, why=why)
     if preset is None:
@@ -55,7 +55,7 @@ def _label(name: str, preset: str | None) -> str:
 
 
 def differing_keys(runs: Sequence[RunData]) -> dict[str, list[Any]]:
-    """The keys that matter to what is learned and do not have the same value in all runs."""
+    """Finds the keys that matter to what is learned and whose values differ between runs."""
     flat = [compared(run.config) for run in runs]
     keys = dict.fromkeys(key for each in flat for key in each)
     values = {key: [each.get(key) for each in flat] for key in keys if key not in _NOT_COMPARED}
@@ -63,12 +63,12 @@ def differing_keys(runs: Sequence[RunData]) -> dict[str, list[Any]]:
 
 
 def final_scores(groups: Groups) -> dict[str, Interval]:
-    """The interquartile mean of each experiment's runs on one game."""
+    """Returns the interquartile mean of each experiment's runs on one game."""
     return {name: interval([_finals(runs)], iqm) for name, runs in groups.items()}
 
 
 def all_games(games: Mapping[str, Groups]) -> dict[str, Interval]:
-    """The same over all games, where their scores can be compared, for the experiments that have played all of them."""
+    """Returns the same over all games, normalised, for the experiments that have played every game."""
     result = {}
     for name in experiments_of(games):
         strata = [normalised(game, _finals(groups[name])) for game, groups in games.items() if name in groups]
@@ -79,12 +79,11 @@ def all_games(games: Mapping[str, Groups]) -> dict[str, Interval]:
 
 
 def runs_of(games: Mapping[str, Groups]) -> list[RunData]:
-    """All of them."""
     return [run for groups in games.values() for seeds in groups.values() for run in seeds]
 
 
 def experiments_of(games: Mapping[str, Groups]) -> list[str]:
-    """The names, each once, as they come."""
+    """Lists the experiments' names, each once, in their order."""
     return list(dict.fromkeys(name for groups in games.values() for name in groups))
 
 

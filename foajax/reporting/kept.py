@@ -1,4 +1,4 @@
-"""Runs that are kept in `results/runs/`: what others need to judge and repeat them, and the tables of them."""
+"""Keeps in `results/runs/` what others need to judge and repeat a run; makes the table of kept runs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,13 @@ _MACHINE = ("cpu", "cores", "devices", "system", "python", "packages")
 
 
 def keep(path: Path, name: str | None) -> Path:
-    """Copies what matters of a run."""
+    """Copies what others need of a run; returns where to.
+
+    Raises:
+      ConfigError: the run is not finished, or its evaluation or heat map is missing; `name` is that of another run.
+    """
     run = read_run(path)
-    newest = newest_checkpoint(path) or int(run.env_steps[-1])  # rows of a run that was killed may go on beyond it
+    newest = newest_checkpoint(path) or int(run.env_steps[-1])  # a killed run's rows may go on beyond it
     if newest < run.config.train.env_steps:
         why = f"has {newest:,} of its {run.config.train.env_steps:,} env_steps"
         raise refuse("run", path, "a finished run, or one that is given fewer train.env_steps", why=why)
@@ -37,11 +41,11 @@ def keep(path: Path, name: str | None) -> Path:
     wanted = {"env_steps": newest, "policy": "sampled", "episodes": episodes}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
-        command = f"evaluate run={path} episodes={episodes} json={path}/score.json"
+        command = f"foajax evaluate run={path} episodes={episodes} json={path}/score.json"
         raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
     heat = heatmap.of_run(path, newest)
     if heat is None and watched:
-        command = f"render run={path} episodes=10 video=false"
+        command = f"foajax render run={path} episodes=10 video=false"
         raise refuse("run", path, f"what {command} writes", why="has no heat map of its final policy in render/")
     config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
@@ -64,8 +68,8 @@ def keep(path: Path, name: str | None) -> Path:
 
 
 def protocol(config: Config) -> tuple[int, bool]:
-    """How many episodes a kept score is the mean of, and whether a heat map has to show where the gaze was."""
-    if config.searches:  # a scene takes some decisions, and a target may be anywhere in it
+    """Returns the number of episodes that a kept score averages, and whether a heat map is needed."""
+    if config.searches:  # scenes are short, and targets may be anywhere, so that a heat map says little
         return 2000, False
     return 100, config.gaze.mode == "learned"
 
@@ -76,7 +80,7 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
 
 def _facts(run: RunData, newest: int) -> dict[str, Any]:
     starts = json.loads((run.path / "run.json").read_text())["starts"]
-    # What a later start changes, such as train.env_steps, is part of what has to be repeated.
+    # The last start's words, as it may have changed keys such as train.env_steps.
     words = [word for word in starts[-1]["command"] if "=" in word and not word.startswith("run=")]
     return {
         "command": f"python -m foajax.train {shlex.join(words)}",
@@ -89,17 +93,16 @@ def _facts(run: RunData, newest: int) -> dict[str, Any]:
 
 
 def runs(directory: Path = KEPT) -> list[RunData]:
-    """All kept runs."""
     return [read_run(path) for path in sorted(directory.glob("*/*")) if path.is_dir()]
 
 
 def record(run: RunData) -> dict[str, Any]:
-    """Command, commits, seed, machine and hours of a kept run."""
+    """Reads command, commits, seed, machine and hours of a kept run."""
     return json.loads((run.path / "run.json").read_text())
 
 
 def row(run: RunData) -> list[str]:
-    """A line of the table."""
+    """Makes a run's row of the table."""
     facts, score = record(run), run.evaluation or {}
     values = make_sensor(run.config.sensor).count(run.config.env.frame_shape).nominal
     digits = 1 if score["stderr"] >= 0.05 else 3  # a scene of search earns 1 at most
@@ -117,7 +120,7 @@ def row(run: RunData) -> list[str]:
 
 
 def write_table(runs: Sequence[RunData], directory: Path = KEPT) -> None:
-    """Makes the table of kept runs anew."""
+    """Writes the table of kept runs."""
     head = ["game", "experiment", "seed", "values", "gaze", "env_steps", "hours", "score", "kept in"]
     intro = (
         "Score: mean and standard error over 100 whole games, unclipped, or over 2,000 scenes of search; sampled\n"

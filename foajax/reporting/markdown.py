@@ -1,4 +1,4 @@
-"""Markdown that is written from data."""
+"""Writes data as Markdown."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ _BLOCK = re.compile(r"(<!-- results: [^>]*-->\n).*?(<!-- /results -->)", re.DOTA
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table, without a line's end at its end."""
+    """Makes a table, without a newline at its end."""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
 
 
 def fill(page: str, block: str) -> str:
-    """A page with `block` between its marks `<!-- results: ... -->` and `<!-- /results -->`."""
+    """Puts `block` between a page's marks `<!-- results: ... -->` and `<!-- /results -->`."""
     return _BLOCK.sub(lambda found: found[1] + block + found[2], page)

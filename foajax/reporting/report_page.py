@@ -1,4 +1,4 @@
-"""The report of a set of runs: one page that needs nothing else, and its figures beside it."""
+"""Writes the report of a set of runs: one page that needs no other file, and its figures beside it."""
 
 from __future__ import annotations
 
@@ -30,18 +30,17 @@ PAGE = "index.html"
 
 
 class Page:
-    """The page's body, and the figures beside it."""
+    """Collects the page's body and writes the figures beside it."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._parts: list[str] = []
 
     def add(self, text: str) -> None:
-        """Appends HTML."""
         self._parts.append(text)
 
     def figure(self, figure: Figure, name: str, alternative: str) -> None:
-        """Appends a figure as a drawing, and writes it as a PNG."""
+        """Appends a figure as SVG, and writes it as a PNG too."""
         figure.savefig(self._directory / f"{name}.png", dpi=160)
         content = io.BytesIO()
         with rc_context({"svg.hashsalt": "foajax"}):  # the same figure, the same file
@@ -49,7 +48,7 @@ class Page:
         self.add(_image(content.getvalue(), "svg+xml", alternative))
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> None:
-        """Appends a table of HTML cells; `numbers` are the columns set to the right."""
+        """Appends a table of HTML cells; the columns `numbers` are aligned to the right."""
 
         def line(cells: Sequence[str], tag: str) -> str:
             kind = [' class="number"' if i in numbers else "" for i in range(len(cells))]
@@ -75,7 +74,7 @@ def _image(content: bytes, kind: str, alternative: str) -> str:
 def build(
     games: Mapping[str, Groups], maps: Mapping[Path, HeatMap], *, out: str, preset: str | None, repeats: int
 ) -> Path:
-    """Writes the page and its figures to `out`; returns the page's path. `repeats` of each timing, 0 for no costs."""
+    """Writes page and figures to `out`; returns the page's path. `repeats`: of each timing; 0 leaves out the costs."""
     directory = make_directory(out)
     page = Page(directory)
     runs = runs_of(games)
@@ -174,7 +173,7 @@ def _add_runs(page: Page, runs: Sequence[RunData], directory: Path) -> None:
 
 
 def _origin(run: RunData) -> str:
-    """Where the score is from; an evaluation may be of an earlier checkpoint."""
+    """Says where the score is from; an evaluation may be of an earlier checkpoint."""
     if run.evaluation is None:
         return "training"
     evaluated = run.evaluation.get("env_steps", run.env_steps[-1])
@@ -183,7 +182,7 @@ def _origin(run: RunData) -> str:
 
 
 def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]:
-    """Heat maps found in the runs' directories; of a group without any, its first run plays."""
+    """Finds heat maps in the runs' directories. For a group without any, its first run plays `episodes` games."""
     maps: dict[Path, HeatMap] = {}
     for groups in games.values():
         for seeds in groups.values():
@@ -195,16 +194,16 @@ def find_maps(games: Mapping[str, Groups], episodes: int) -> dict[Path, HeatMap]
 
 
 def _stored_map(run: RunData) -> HeatMap | None:
-    """The one in the run's directory, where a new one would be of the same agent and policy."""
+    """Reads a run's heat map, if the newest checkpoint made it in whole games with sampled actions."""
     newest = newest_checkpoint(run.path) or int(run.env_steps[-1])  # a run may be kept without its checkpoints
     heat, file = heatmap.of_run(run.path, newest), run.path / "render" / heatmap.FILE
     if heat is None and file.exists():
-        note(f"{file}: left out, as it is not known to be of whole, sampled games at {newest:,} env_steps")
+        note(f"{file}: left out, as it may not show whole games with sampled actions at {newest:,} env_steps")
     return heat
 
 
 def _make_map(run: RunData, episodes: int) -> HeatMap | None:
-    """Of games played now; None where the run has nothing that could play."""
+    """Plays games and makes their heat map; None if the run has no agent that can play."""
     try:
         stored = load_agent(run.path, trust=True)  # as `read_run` was told
         with progress_bar() as bar:
@@ -215,14 +214,14 @@ def _make_map(run: RunData, episodes: int) -> HeatMap | None:
         return None
     file = run.path / "render" / heatmap.FILE
     there = heatmap.read(file) if file.exists() else None
-    if there is None or (there.policy != "greedy" and there.whole_games is not False):  # others were made on purpose
+    if there is None or (there.policy != "greedy" and there.whole_games is not False):  # a user made others on purpose
         try:
             heatmap.save(heat, make_directory(file.parent), f"{run.config.name} on {run.config.game}")
         except (ConfigError, OSError) as error:
-            note(f"{file}: not kept ({error})")
+            note(f"{file}: cannot be written ({error}); the page shows the heat map")
     return heat
 
 
 def note(text: str) -> None:
-    """A line beside the results."""
+    """Prints a line on stderr, beside the results."""
     print(text, file=sys.stderr, flush=True)

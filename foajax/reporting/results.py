@@ -1,4 +1,4 @@
-"""docs/results.md and the README's block: figures, tables and the paper's claims, all made from kept runs."""
+"""Makes docs/results.md and the README's block from kept runs: figures, tables and the paper's claims."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")
 
 
 def by_game(runs: Sequence[RunData]) -> dict[str, Game]:
-    """Kept runs by game; `time` is in core seconds.
+    """Groups kept runs by game; their `time` becomes core seconds.
 
     Raises:
       ConfigError: runs of a game that are compared differ in more than sensor, gaze and seed.
@@ -55,7 +55,7 @@ def by_game(runs: Sequence[RunData]) -> dict[str, Game]:
 
 
 def _label(run: RunData) -> str:
-    """The experiment's name without `_packed`; a sensor that could be packed and is not is called a canvas."""
+    """Returns the experiment's name without `_packed`; adds "canvas" if its sensor could be packed and is not."""
     name = run.config.name.replace("_packed", "")
     is_canvas = make_sensor(run.config.sensor).in_place and name != "nonfoa"
     return f"{name}, canvas" if is_canvas else name
@@ -83,7 +83,7 @@ def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
 
 
 def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
-    """The text of docs/results.md.
+    """Makes the text of docs/results.md.
 
     Args:
       games: kept runs, by game.
@@ -168,7 +168,7 @@ def _bold(verdict: str) -> str:
 
 
 def _anchor(title: str) -> str:
-    """As GitHub makes them."""
+    """Makes a heading's anchor as GitHub does."""
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
@@ -240,14 +240,14 @@ def _cost(record: Mapping[str, Any] | None) -> list[str]:
 
 
 def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str | None:
-    """What the README shows: Breakout, the whole frame and a gaze moved in several ways; None before it was run."""
+    """Makes the README's block: the whole frame and several gazes on Breakout; None before the first three were run."""
     game = games.get("breakout", Game("breakout", {}))
     there = [label for label in _GAZES if label in game.runs]
     if there[:3] != list(_GAZES)[:3]:
         return None
     rows = []
     for label in there:
-        name = game.runs[label][0].config.name  # what one types: with `_packed`
+        name = game.runs[label][0].config.name  # as it is typed, with `_packed`
         rows.append([f"{_GAZES[label]} (`{name}`)", *_row(game, label, costs)[1:5]])
     whole, learned, frozen = (
         claims.above_chance(claims.score(game.runs[label]), game.name).value for label in list(_GAZES)[:3]
@@ -283,7 +283,7 @@ def draw(games: Mapping[str, Game], directory: Path) -> None:
 
 
 def write(runs: Sequence[RunData], root: Path = ROOT) -> None:
-    """Makes docs/results.md, its figures and the README's block of a checkout anew from its kept runs."""
+    """Writes docs/results.md, its figures, the README's block and docs/search.md of a checkout from its kept runs."""
     games = by_game(runs)
     costs = json.loads((root / "results" / "bench" / "cost.json").read_text())["results"]
     (root / "docs" / "results").mkdir(exist_ok=True)

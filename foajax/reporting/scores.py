@@ -1,7 +1,7 @@
-"""Scores of several runs in one number, with its uncertainty: interquartile mean and stratified bootstrap.
+"""Sums up the scores of several runs in one number, with its uncertainty: interquartile mean, stratified bootstrap.
 
 As in Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice* (2021), and its library
-rliable. Scores are given game by game, one number a run; games may have different numbers of runs.
+rliable. Scores are given game by game, one number per run; games may have different numbers of runs.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ REFERENCE = {
 
 
 class Interval(NamedTuple):
-    """A number and the interval that holds it with `CONFIDENCE`; equal ends where there is one run."""
+    """A number and its interval of `CONFIDENCE`, whose ends are equal for a single run."""
 
     value: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """In three digits or whole numbers."""
+        """Writes three digits or, from 1,000 on, whole numbers."""
         value, low, high = (f"{each:,.0f}" if 1000 <= abs(each) < math.inf else f"{each:.3g}" for each in self)
         return f"{value} [{low}, {high}]" if low != high else value
 
 
 def iqm(scores: Float[np.ndarray, "n"]) -> float:
-    """Mean of what is left without the lowest and the highest quarter, each rounded down to whole scores."""
+    """Averages the scores without their lowest and highest quarter, each rounded down to whole scores."""
     cut = len(scores) // 4
     return float(np.sort(scores)[cut : len(scores) - cut].mean())
 
 
 def interval(strata: Sequence[Float[np.ndarray, "_"]], statistic: Callable[[np.ndarray], float]) -> Interval:
-    """A statistic of all scores together, and its percentile interval by stratified bootstrap.
+    """Returns a statistic of all scores together, and its percentile interval by stratified bootstrap.
 
     Each resample draws, game by game, as many of the game's runs as there are, with replacement.
 
     Args:
-      strata: scores of a game's runs, one array a game.
+      strata: scores of a game's runs, one array per game.
       statistic: of an array of scores.
     """
     random = np.random.default_rng(0)
@@ -62,12 +62,12 @@ def interval(strata: Sequence[Float[np.ndarray, "_"]], statistic: Callable[[np.n
 
 
 def resampled(runs: Float[np.ndarray, "n *m"], random: np.random.Generator) -> Float[np.ndarray, "_ n *m"]:
-    """`RESAMPLES` samples, each of as many runs as there are, drawn with replacement."""
+    """Draws `RESAMPLES` samples with replacement, each of as many runs as there are."""
     return runs[random.integers(0, len(runs), (RESAMPLES, len(runs)))]
 
 
 def normalised(game: str, scores: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
-    """0 for random play, 1 for a human (who sees all, in seek); None for a game without a reference."""
+    """Scales scores to 0 for random play and 1 for a human, in seek for full sight; None without a reference."""
     if game not in REFERENCE:
         return None
     low, high = REFERENCE[game]

@@ -1,4 +1,4 @@
-"""What visual search has shown: the figure and the tables of docs/search.md, made from kept runs."""
+"""Makes the figure and the tables of docs/search.md from kept runs of visual search."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ Groups = Mapping[str, Sequence[RunData]]
 
 
 def over_seeds(values: Sequence[float]) -> Interval:
-    """The mean over runs that differ in their seed, with Student's interval; of one run, the number alone."""
+    """Averages over seeds, with Student's interval; for one run, the interval is the number itself."""
     mean = float(np.mean(values))
     if len(values) == 1:
         return Interval(mean, mean, mean)
@@ -65,12 +65,12 @@ def over_seeds(values: Sequence[float]) -> Interval:
 
 
 def measure(runs: Sequence[RunData], name: str) -> Interval:
-    """A measure of the runs' evaluations (`foajax.envs.measures.summarise`)."""
+    """Averages a measure of the runs' evaluations (`foajax.envs.measures.summarise`)."""
     return over_seeds([_measures(run)[name] for run in runs])
 
 
 def earned(runs: Sequence[RunData], size: int) -> Interval:
-    """The return in scenes of so many letters."""
+    """Averages the return in scenes of `size` letters."""
     return over_seeds(
         [
             2 * _measures(run)[f"accuracy_{size}"] - 1 - run.config.search.price * _measures(run)[f"decisions_{size}"]
@@ -84,7 +84,7 @@ def _measures(run: RunData) -> dict[str, float]:
 
 
 def block(groups: Groups) -> str:
-    """The tables, and what an answer costs."""
+    """Makes the part of docs/search.md with the tables and the cost of an answer."""
     returns = (f"return at {size}" for size in SIZES)
     head = ["values", "trained for", "seeds", *returns, f"accuracy at {SIZES[-1]}", "decisions, all sizes"]
     slopes = ["trained for", "seeds", "with a target", "without", "accuracy"]
@@ -127,7 +127,7 @@ def _slopes(groups: Groups, name: str, label: str) -> list[str]:
 
 
 def _trained(runs: Sequence[RunData]) -> tuple[str, str]:
-    """How long, in millions of decisions, and how many seeds."""
+    """Returns how long the runs were trained, in millions of decisions, and their number."""
     return f"{runs[0].config.train.env_steps / 1e6:g} M", str(len(runs))
 
 
@@ -169,14 +169,14 @@ def _size(shape: tuple[int, int]) -> str:
 
 
 def whole(config: Config) -> Config:
-    """The same network on the whole frame, without a gaze."""
+    """Returns `config` with the whole frame, without a gaze."""
     sensor = RingSensor(rings=((*config.env.frame_shape, 1),), layout="packed")
     network = replace(config.network, priority_map=False)
     return replace(config, sensor=sensor, gaze=GazeConfig(mode="none"), network=network)
 
 
 def draw(groups: Groups) -> Figure:
-    """Left: the return by set size of sensors of about 600 values. Right: fixations by set size."""
+    """Draws, by set size, the return of sensors of about 600 values (left) and the fixations (right)."""
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 4.2), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -203,7 +203,7 @@ def _line(plot: Any, found: Sequence[Interval], **style: Any) -> None:
 
 
 def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
-    """The runs of search and detection by name."""
+    """Groups the runs of search and detection by name."""
     groups: dict[str, list[RunData]] = {}
     for run in runs:
         if run.config.searches:
@@ -212,7 +212,7 @@ def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
 
 
 def write(runs: Sequence[RunData], docs: Path) -> None:
-    """Makes the figure of docs/search.md and the part of it that runs have shown anew; nothing before there are any."""
+    """Writes the figure and the tables of docs/search.md; does nothing if there are no runs of search."""
     if groups := grouped(runs):
         save(draw(groups), docs / "results" / "search.png")
         page = docs / "search.md"

@@ -1,4 +1,4 @@
-"""A trained agent as a folder that runs without this package: `python -m foajax.export` writes it.
+"""Exports a trained agent as a folder that runs without this package; `foajax export` calls it.
 
-`agent.py`, `camera.py` and `node.py` are copied into that folder as they are. They import nothing of this package.
+`agent.py`, `check.py`, `camera.py` and `node.py` are copied into that folder. They import nothing of this package.
 """

@@ -1,10 +1,10 @@
-"""A trained agent that sees, decides and moves its gaze. It needs NumPy and ONNX Runtime, nothing else.
+"""Runs a trained agent, which sees, decides and moves its gaze. It needs only NumPy and ONNX Runtime.
 
     agent = Agent("robot/")
     natural, vision = agent.decide(frame)  # once per frame: memory and focal point go on from call to call
     agent.reset()  # where an episode begins
 
-`python agent.py --check` replays the decisions recorded in golden.npz and compares.
+`python agent.py --check` replays the decisions that were recorded in `golden.npz`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WHOLE = slice(None), slice(None)  # all rows and columns of a frame
 
 
 class AgentError(Exception):
-    """What the caller can mend, in one line."""
+    """A mistake that the caller can correct. The message is one line."""
 
 
 class Agent:
@@ -40,10 +40,10 @@ class Agent:
     Args:
       folder: what `foajax export` wrote.
       greedy: take the likeliest actions; else draw them, as in training.
-      seed: of what is drawn.
+      seed: of drawn actions and of a random gaze.
       source: 'screen' for Atari screens to crop, uint8 [210, 160]; 'camera' for uint8 [h, w] or [h, w, 3] of any size;
         by default what the agent was trained with. One that sees colours takes [210, 160, 3] or [h, w, 3].
-      order: of a colour image's channels, 'rgb' or 'bgr' (OpenCV's).
+      order: of a colour image's channels: 'rgb', or 'bgr' as OpenCV has it.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Agent:
         self.facts = read_facts(self.folder)
         self.greedy, self.source, self.order = greedy, source or self.facts["source"], order
         if self.source not in ("screen", "camera") or (self.source == "screen" and self.facts["crop_top"] is None):
-            raise AgentError(f"source={self.source}: accepted is camera, or screen where the agent crops Atari's")
+            raise AgentError(f"source={self.source}: accepted is camera, or screen for an agent of Atari screens")
         self._random = np.random.default_rng(seed)
         self._limits = np.array(self.facts["gaze"]["limits"])  # smallest and largest focal point
         with np.load(self.folder / "arrays.npz") as arrays:
@@ -66,7 +66,7 @@ class Agent:
         self.reset()
 
     def reset(self) -> None:
-        """Begins an episode: empty memory, the gaze at its start, no last action."""
+        """Begins an episode: clears memory and last actions, moves the gaze to its start."""
         states = {name[5:]: shape[1:] for name, shape in self._outputs.items() if name.startswith("next_")}
         self.core = {name: np.zeros((1, *shape), np.float32) for name, shape in states.items()}
         self.age = 0  # decisions since the episode began
@@ -78,10 +78,10 @@ class Agent:
         self.outputs: dict[str, np.ndarray] = {}  # of the network at the last decision
 
     def decide(self, frame: np.ndarray, reward: float = 0.0) -> tuple[int, int]:
-        """The natural and the visual action upon a frame; `reward` is what the last action earned.
+        """Decides upon a frame; returns the natural and the visual action. `reward` is what the last action earned.
 
         Raises:
-          AgentError: the frame is not as the agent takes it. The agent's state is as before then.
+          AgentError: the frame or the reward is not accepted. The agent's state stays as it was.
         """
         frame = self.frame(frame, self._sensors[0].reads(self.focal_point))
         seen = [sensor.look(frame, self.focal_point) for sensor in self._sensors]
@@ -99,7 +99,7 @@ class Agent:
         return natural, vision
 
     def frame(self, image: np.ndarray, area: tuple = WHOLE) -> np.ndarray:
-        """A screen, or an area of a camera's image, as the frame looked at: float32 [H, W] or [H, W, 3] in [0, 1]."""
+        """Makes the frame, float32 [H, W] or [H, W, 3] in [0, 1], of a screen or, inside `area`, a camera's image."""
         shape, kind = getattr(image, "shape", ()), str(getattr(image, "dtype", type(image).__name__))
         is_camera, color = self.source == "camera", self.facts["color"]
         size = ("h", "w") if is_camera else SCREEN
@@ -107,7 +107,8 @@ class Agent:
         is_image = kind == "uint8" and len(shape) > 1 and 0 not in shape and shape[2:] in pixels
         if not is_image or (shape[:2] != SCREEN and not is_camera):
             accepted = " or ".join(f"[{', '.join(map(str, size + pixel))}]" for pixel in pixels)
-            raise AgentError(f"frame={kind} {list(shape)}: accepted is uint8 {accepted}{', gray' * (pixels == ((),))}")
+            gray, hint = ", gray" * (pixels == ((),)), "" if is_camera else "; source='camera' takes any size"
+            raise AgentError(f"frame={kind} {list(shape)}: accepted is uint8 {accepted}{gray}{hint}")
         if shape[2:] and self.order not in ("rgb", "bgr"):
             raise AgentError(f"order={self.order}: accepted is rgb or bgr")
         if is_camera and shape != (*self.facts["frame_shape"], *pixels[0]):
@@ -117,7 +118,7 @@ class Agent:
         return image.astype(np.float32) * np.float32(1 / 255) if is_camera else halve(image, self.facts["crop_top"])
 
     def _side(self, reward: float) -> dict[str, np.ndarray]:
-        """What the network is told beside the images."""
+        """Makes the input `side`, float32 [1, S]: what the network is told beside the images, if anything."""
         told, parts = self.facts["side"], []
         if told["focal_point"] == "frame":
             parts.append(self.focal_point / np.array(self.facts["frame_shape"]) * 2.0 - 1.0)
@@ -144,19 +145,19 @@ class Agent:
 
 
 class Sensor:
-    """What one channel shows around a focal point: float32 images [h, w]. What lies outside or is hidden is 0."""
+    """Looks at one channel of a frame. What lies outside the frame, or where a finer ring is, gives 0."""
 
     def __init__(self, facts: dict[str, Any], arrays: dict[str, np.ndarray], channel: int = 0) -> None:
         self._sensor, self._shape, self._window = facts["sensor"], facts["frame_shape"], np.array(facts["window"])
         self._arrays, self._channel, self._by_frame = arrays, channel, facts["normalisation"] == "frame"
 
     def reads(self, focal_point: np.ndarray) -> tuple:
-        """The rows and columns that `look` reads of a frame, as slices."""
+        """Returns the rows and columns of a frame that `look` reads, as slices."""
         whole, corner = self._by_frame or self._sensor.get("peripheral"), focal_point - self._window // 2
         return WHOLE if whole else tuple(map(slice, *np.clip([corner, corner + self._window], 0, self._shape)))
 
     def look(self, frame: np.ndarray, focal_point: np.ndarray) -> list[np.ndarray]:
-        """The images at a focal point (y, x). The frame is normalised where it is looked at, and only there."""
+        """Returns the normalised images, float32 [h, w] each, at a focal point (y, x)."""
         frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3)) if self._by_frame else frame
         frame, arrays, sensor = np.atleast_3d(frame)[..., self._channel], self._arrays, self._sensor
         top, left = (focal_point - self._window // 2).tolist()
@@ -174,7 +175,7 @@ class Sensor:
         return [self._canvas(images, top, left)] if sensor["layout"] == "canvas" else images
 
     def _cut(self, image: np.ndarray, top: int, left: int) -> np.ndarray:
-        """The focal area with its top-left pixel at (top, left)."""
+        """Cuts out the focal area whose top-left pixel is (top, left)."""
         y, x = max(top, 0), max(left, 0)
         part = image[y : top + self._window[0], x : left + self._window[1]]
         area = np.zeros(self._window, np.float32)
@@ -182,7 +183,7 @@ class Sensor:
         return area
 
     def _sums(self, window: np.ndarray, height: int, width: int, factor: int) -> np.ndarray:
-        """The sum of each block of a ring, or its first pixel; the last blocks may be smaller."""
+        """Sums up each block of a ring, or takes its first pixel (`stride`); the last blocks may be smaller."""
         top, left = self._window // 2 - (height // 2, width // 2)
         area = window[top : top + height, left : left + width]
         if factor == 1 or self._sensor["pooling"] == "stride":
@@ -190,14 +191,14 @@ class Sensor:
         return _block_sums(_block_sums(area, factor).T, factor).T
 
     def _cells(self, image: np.ndarray) -> np.ndarray:
-        """The peripheral grid, the whole frame in coarse cells: the sum of each, or its first pixel."""
+        """Sums up each cell of the peripheral grid, which covers the frame, or takes its first pixel (`stride`)."""
         rows, columns = self._arrays["row_edges"][:-1], self._arrays["column_edges"][:-1]
         if self._sensor["pooling"] == "stride":
             return image[rows][:, columns]
         return np.add.reduceat(np.add.reduceat(image, rows, 0), columns, 1)
 
     def _canvas(self, images: list[np.ndarray], top: int, left: int) -> np.ndarray:
-        """Every value painted over the pixels that it stands for, on an image of the frame's size."""
+        """Paints every value over the pixels that it stands for, on an image of the frame's size."""
         values = np.concatenate([*(image.ravel() for image in images), np.zeros(1, np.float32)])
         canvas = values.take(self._arrays["paint_background"])
         y, x, area = max(top, 0), max(left, 0), values.take(self._arrays["paint_window"])
@@ -207,10 +208,10 @@ class Sensor:
 
 
 def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray | None, area: tuple = WHOLE) -> np.ndarray:
-    """A camera's image as a frame, uint8 [H, W] or, without luma, [H, W, 3]: area means, rounded half up; 0 elsewhere.
+    """Shrinks a camera's image to a frame by area means: uint8 [H, W] or, without luma, [H, W, 3]; 0 outside `area`.
 
-    An image at least twice as large as the frame is added up before its colours are mixed. Training rounds the gray of
-    each pixel first, so that some pixels of the frame may differ by one gray level; of others, only exact halves may.
+    An image at least twice as large as the frame is averaged before its colours are mixed. Training rounds the gray of
+    each pixel first, so pixels of the frame may differ by one gray level. In smaller images only exact halves may.
     """
     if image.ndim == 3 and luma is not None and np.any(np.array(image.shape[:2]) < 2 * np.array(frame_shape)):
         image = ((image @ np.rint(1000 * luma).astype(int) + 500) // 1000).astype(np.uint8)
@@ -225,7 +226,7 @@ def shrink(image: np.ndarray, frame_shape: Sequence[int], luma: np.ndarray | Non
 
 
 def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray | None) -> np.ndarray:
-    # The first step reads every byte, and so it adds up before colours are mixed. No matrix products here: their
+    # Rows are summed before colours are mixed, as the first step reads every byte. No matrix products here: their
     # threads would wait for each other. `_share` needs a spare sum at the end.
     (first, shared, part, height), (left, divided, piece, width) = spans
     image = image[first[0] : first[-1] + 1, left[0] : left[-1] + 1]
@@ -250,23 +251,24 @@ def _add_up(image: np.ndarray, spans: Sequence[tuple], luma: np.ndarray | None) 
 
 
 def halve(screen: np.ndarray, crop_top: int) -> np.ndarray:
-    """Mean of each 2x2 block of the screen rows crop_top .. crop_top + 159: float32 [80, 80] in [0, 1]."""
+    """Averages each 2x2 block of the screen's rows crop_top .. crop_top + 159: float32 [80, 80] in [0, 1]."""
     kept = screen[crop_top : crop_top + 160].astype(np.uint16)
     rows = kept[0::2] + kept[1::2]
     return (rows[:, 0::2] + rows[:, 1::2]).astype(np.float32) * np.float32(1 / 1020)
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
-    """What agent.json says, once the files that it decides with are those that were exported."""
+    """Reads agent.json and checks that `policy.onnx` and `arrays.npz` are the files that were exported."""
     try:
         facts = json.loads((folder / "agent.json").read_text(encoding="utf-8"))
         if facts["format"] != 1:
-            raise AgentError(f"{folder}: has format {facts['format']}; accepted by this agent.py is 1")
+            raise AgentError(f"{folder}: has format {facts['format']}; accepted by this agent.py is 1; export again")
         for name in ("policy.onnx", "arrays.npz"):
             if hashlib.sha256((folder / name).read_bytes()).hexdigest() != facts["files"][name]:
                 raise AgentError(f"{folder / name}: is not the file that was exported; export again")
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise AgentError(f"{folder}: accepted is a folder that foajax export wrote ({error!r})") from None
+        why = f"{type(error).__name__}: {error}"
+        raise AgentError(f"{folder}: accepted is a folder that foajax export wrote ({why})") from None
     return facts
 
 
@@ -279,7 +281,7 @@ def _spans(source: int, target: int, begin: int, end: int) -> tuple[np.ndarray, 
 
 
 def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """The sums, once pixels that two of them share are divided between these; the last takes what is nobody's."""
+    """Moves the part of each shared pixel to the sum before; the spare last sum takes that before the first one."""
     moved = part * pixels
     sums[shared] -= moved
     sums[shared - 1] += moved

@@ -1,9 +1,9 @@
-"""The agent in front of a camera: `python camera.py --source 0`, or a video file, or a stream's address.
+"""Lets the agent look through a camera, at a video file or at a stream: `python camera.py --source 0`.
 
-It reads, decides, calls what drives the robot (`--drive my_robot:drive`, called with the natural and the visual action;
-what it returns is the reward, None for 0), and draws where it looks (`--draw seen.mp4`). Latencies of each stage are
-printed every `--log-every` seconds. SIGTERM and Ctrl-C end it after the frame at hand. A camera that is lost is opened
-again, up to `--retries` times in a row; the agent's memory goes on. The end of a file is the end.
+For each image the agent decides. `--drive my_robot:drive` names a function that gets the natural and the visual action
+and moves the robot; it returns the reward, None for 0. `--draw seen.mp4` films where the agent looks. Every
+`--log-every` seconds a line says how long each stage takes. SIGTERM and Ctrl-C end the loop after the current frame.
+A lost camera is opened again, up to `--retries` times in a row, and the agent keeps its memory. A file ends the loop.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from agent import Agent, AgentError
 
 Drive = Callable[[int, int], float | None]
 STAGES = ("read", "decide", "drive", "draw")
-KEPT = 1000  # latencies of a stage that percentiles are taken of
+KEPT = 1000  # newest latencies of a stage, for its percentiles
 COLOUR = (0, 255, 255)  # of the drawn areas, BGR
 
 
 class Camera:
-    """Images of an OpenCV source, BGR, opened again where they stop coming.
+    """Reads BGR images from an OpenCV source and opens it again when they stop.
 
     Args:
-      source: a device's number, a file or a stream's address.
-      rate: decisions per second that the agent is used to; images in between are left out.
+      source: a camera's number, a file or a stream's address.
+      rate: decisions per second that the agent is used to; images in between are skipped.
       retries: how often in a row the source is opened again.
-      wait: seconds before that.
+      wait: seconds before each attempt.
     """
 
     def __init__(self, source: str, *, rate: float, retries: int = 5, wait: float = 1.0) -> None:
@@ -46,14 +46,15 @@ class Camera:
         self._is_file, self._retries, self._wait = Path(source).is_file(), retries, wait
         self._capture = cv2.VideoCapture(self._source)
         if not self._capture.isOpened():
-            raise AgentError(f"source={source}: accepted is a camera's number, a video file or a stream that opens")
+            accepted = "a camera's number, a video file or a stream's address"
+            raise AgentError(f"source={source}: cannot be opened; accepted is {accepted}")
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         fps = fps if 0 < fps < 1000 else rate  # some drivers say 0, or nonsense
         self.every = max(1, round(fps / rate))  # one image in so many is decided upon
         self.period = self.every / fps  # seconds between two decisions
 
     def images(self, stopped: Callable[[], bool]) -> Iterator[np.ndarray]:
-        """Image after image until a file ends, `stopped()`, or `AgentError` where the camera is gone for good."""
+        """Yields images until a file ends or `stopped()`; `AgentError` if a lost camera does not come back."""
         while not stopped():
             image = self._read()
             if image is not None:
@@ -62,7 +63,6 @@ class Camera:
                 return
 
     def close(self) -> None:
-        """Gives the device back."""
         self._capture.release()
 
     def _read(self) -> np.ndarray | None:
@@ -73,7 +73,7 @@ class Camera:
         return image if found else None
 
     def _reopen(self, stopped: Callable[[], bool]) -> bool:
-        """Whether the camera is there again; False where it was `stopped` meanwhile."""
+        """Opens a lost camera again; returns False if `stopped()` meanwhile."""
         for attempt in range(1, self._retries + 1):
             say(f"camera lost; attempt {attempt} of {self._retries} in {self._wait:g} s")
             self._capture.release()
@@ -88,14 +88,14 @@ class Camera:
 
 
 class Latencies:
-    """How long each stage took, in seconds."""
+    """Collects how long each stage takes, in seconds."""
 
     def __init__(self) -> None:
         self._kept = {stage: collections.deque[float](maxlen=KEPT) for stage in STAGES}
         self.frames = self.late = 0  # so far
 
     def add(self, seconds: dict[str, float], period: float) -> None:
-        """Takes in one frame; warns where what comes after reading takes longer than `period`."""
+        """Adds one frame; warns if the stages after reading take longer than `period`, in seconds."""
         self.frames += 1
         for stage, value in seconds.items():
             self._kept[stage].append(value)
@@ -122,7 +122,7 @@ def run(
     stopped: Callable[[], bool] = lambda: False,
     log_every: float = 10.0,
 ) -> Latencies:
-    """The loop, until the camera's images end or `stopped()`; gives the latencies of its stages."""
+    """Decides upon each image until they end or `stopped()`; returns the latencies of the stages."""
     latencies, logged, reward = Latencies(), time.monotonic(), 0.0
     begin = time.perf_counter()
     for image in camera.images(stopped):
@@ -146,7 +146,7 @@ def run(
 
 
 def drawn(image: np.ndarray, agent: Agent) -> np.ndarray:
-    """The image with the areas that the agent has just looked at, and what it decided."""
+    """Draws the areas that the agent has just looked at, and the natural action, on a copy of the image."""
     image = image.copy() if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     scale = np.array(image.shape[:2]) / agent.facts["frame_shape"]
     sensor = agent.facts["sensor"]
@@ -162,7 +162,7 @@ def drawn(image: np.ndarray, agent: Agent) -> np.ndarray:
 
 
 class Film:
-    """A video file of what is drawn, opened with the first image's size."""
+    """Writes images to a video file, which is opened with the first image's size."""
 
     def __init__(self, path: str, period: float) -> None:
         self._path, self._fps = path, 1 / period
@@ -173,22 +173,21 @@ class Film:
             codec = cv2.VideoWriter.fourcc(*("MJPG" if self._path.endswith(".avi") else "mp4v"))
             self._writer = cv2.VideoWriter(self._path, codec, self._fps, (image.shape[1], image.shape[0]))
             if not self._writer.isOpened():
-                raise AgentError(f"draw={self._path}: accepted is a file to write, .mp4 or .avi")
+                raise AgentError(f"draw={self._path}: cannot be written; accepted is a .mp4 or .avi file")
         self._writer.write(image)
 
     def close(self) -> None:
-        """Ends the file."""
         if self._writer is not None:
             self._writer.release()
 
 
 def say(text: str) -> None:
-    """One line for whoever watches."""
+    """Prints one line on stderr."""
     print(f"camera: {text}", file=sys.stderr, flush=True)
 
 
 def main(words: list[str] | None = None) -> int:
-    """The command: 0 after a file's end or a request to stop, 1 where something cannot go on."""
+    """Runs the command; returns 0 after a file's end or a request to stop, 1 after an error."""
     options = _options().parse_args(words)
     requests: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -224,15 +223,15 @@ def _options() -> argparse.ArgumentParser:
     text = (__doc__ or "").splitlines()[0]
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--source", default="0", help="a camera's number, a video file or a stream's address")
-    parser.add_argument("--folder", default=str(Path(__file__).parent), help="what foajax export wrote")
-    parser.add_argument("--rate", type=float, help="decisions per second; by default as in training")
+    parser.add_argument("--folder", default=str(Path(__file__).parent), help="folder that foajax export wrote")
+    parser.add_argument("--rate", type=float, help="decisions per second; None: as in training")
     parser.add_argument("--greedy", action="store_true", help="take the likeliest actions")
-    parser.add_argument("--seed", type=int, default=0, help="of drawn actions")
+    parser.add_argument("--seed", type=int, default=0, help="seed of drawn actions")
     parser.add_argument("--drive", help="module:function that moves the robot")
-    parser.add_argument("--draw", help="video file of what was looked at")
+    parser.add_argument("--draw", help="video file to write, with the areas that were looked at")
     parser.add_argument("--retries", type=int, default=5, help="attempts in a row to open a lost camera")
     parser.add_argument("--wait", type=float, default=1.0, help="seconds before each attempt")
-    parser.add_argument("--log-every", type=float, default=10.0, help="seconds")
+    parser.add_argument("--log-every", type=float, default=10.0, help="seconds between two lines of latencies")
     return parser
 
 

@@ -14,12 +14,12 @@ from agent import Agent, AgentError
 
 
 def check(folder: Path) -> dict[str, Any]:
-    """Compares every recorded step; gives how many there were, what differed, and milliseconds.
+    """Compares every recorded step; returns how many there were, how much differed, and milliseconds per decision.
 
-    What was decided at a step is what was recorded, so that one difference does not lead to others.
+    After each step the agent takes over the recorded decision, so that one difference does not lead to others.
 
     Raises:
-      AgentError: more differs than agent.json allows; the message says what comes first.
+      AgentError: more differs than agent.json allows; the message states the first difference.
     """
     agent = Agent(folder, greedy=True)
     _check_files(agent)
@@ -47,14 +47,14 @@ def check(folder: Path) -> dict[str, Any]:
             raise AgentError(f"step {step}: actions are {list(actions)}; accepted is {list(recorded)}, as recorded")
         agent.last_actions = recorded
     if np.mean(same) < allowed["same"]:
-        raise AgentError(f"{np.mean(same):.1%} of the actions are those recorded; accepted is {allowed['same']:.0%}")
+        raise AgentError(f"{np.mean(same):.1%} of the actions are as recorded; accepted is >= {allowed['same']:.0%}")
     median, late = np.percentile(1e3 * np.array(seconds), [50, 99])
     found = {"steps": len(same), "logits": largest, "same": float(np.mean(same))}
     return found | {"median_ms": float(median), "p99_ms": float(late)}
 
 
 def _place_gaze(agent: Agent, golden: dict[str, np.ndarray], step: int) -> None:
-    """The focal point is where it was recorded: by itself, unless it is drawn there or a visual action differed."""
+    """Moves the gaze to the recorded focal point; `AgentError` if it should be there by itself and is not."""
     recorded, gaze = golden["focal_point"][step], agent.facts["gaze"]
     drawn = gaze["mode"] == "random" or (gaze["start"] == "random" and agent.age == 0)
     if not drawn and agent.facts["check"]["same"] == 1 and not np.array_equal(agent.focal_point, recorded):
@@ -64,10 +64,10 @@ def _place_gaze(agent: Agent, golden: dict[str, np.ndarray], step: int) -> None:
 
 
 def main(words: Sequence[str]) -> int:
-    """The command: 0 where the folder does what it was exported to do."""
+    """Checks the folder of this file; returns 0 if it passes, else 1 with a line on stderr."""
     try:
         if list(words) != ["--check"]:
-            raise AgentError(f"{' '.join(words) or 'nothing'}: accepted is --check")
+            raise AgentError(f"{' '.join(words) or 'no words'}: accepted is --check")
         found = check(Path(__file__).parent)
     except AgentError as error:
         print(f"check: error: {error}", file=sys.stderr)
@@ -84,16 +84,16 @@ def _check_files(agent: Agent) -> None:
         file = agent.folder / name
         if not file.exists() or hashlib.sha256(file.read_bytes()).hexdigest() != digest:
             if name.endswith(".py"):
-                print(f"check: {name} has been changed since the export", file=sys.stderr)
+                print(f"check: warning: {name} has been changed since the export", file=sys.stderr)
             else:
                 raise AgentError(f"{name}: is not the file that was exported; export again")
 
 
 def _check_images(agent: Agent, golden: dict[str, np.ndarray]) -> None:
-    """Camera images become frames as in training, to one level of 255."""
+    """Compares the frames made of recorded camera images with training's; one gray level may differ."""
     camera = Agent(agent.folder, source="camera")
     for name in [name for name in golden if name.startswith("image_")]:
         frame, wanted = 255 * camera.frame(golden[name]), golden[name.replace("image", "frame")]
         difference = np.abs(np.rint(frame) - wanted).max()
         if difference > 1:
-            raise AgentError(f"{name}: becomes a frame that differs by {difference:.0f} levels, more than 1")
+            raise AgentError(f"{name}: its frame differs by {difference:.0f} gray levels; accepted is 1")

@@ -1,4 +1,4 @@
-"""Writes the folder: the network, what the sensor needs, the facts, the recorded steps and the code that runs them."""
+"""Writes the folder of an exported agent: network, sensor's tables, facts, recorded steps, and the code to run them."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ def write(
     with_stablehlo: bool = False,
     command: Sequence[str] = (),
 ) -> str:
-    """Writes an agent to `out`, once the folder's own check has passed; gives what the check says.
+    """Writes an agent to `out` if the folder's own check passes; returns the check's line.
 
     Args:
       stored: the agent.
       out: a new directory, or one that an earlier export has written.
-      source: the run or agent that it was read from, for the record.
-      dtype: what the network's weights are stored in, one of `CHECKS`.
-      with_stablehlo: whether the whole decision is written too, as a program for JAX.
-      command: as it was typed, likewise for the record.
+      source: the run or agent that it was read from, for `agent.json`.
+      dtype: type of the stored weights, one of `CHECKS`.
+      with_stablehlo: whether to write the whole decision as a program for JAX too.
+      command: as it was typed, for `agent.json`.
 
     Raises:
       ConfigError: `out` is something else or cannot be written; the network has a part that cannot be exported; the
@@ -91,7 +91,7 @@ def write(
 def fill(
     folder: Path, stored: TrainedAgent, recorded: dict[str, Any], origin: Mapping[str, Any], dtype: str = "float32"
 ) -> None:
-    """Makes the folder, without a check: network, arrays, recorded steps, code, and the facts with all checksums."""
+    """Makes the folder without checking it: network, arrays, recorded steps, code, and facts with all checksums."""
     folder.mkdir()
     config = stored.agent.config
     labels = {"game": config.game, "experiment": config.name, "env_steps": str(stored.env_steps)}
@@ -109,12 +109,12 @@ def fill(
 
 
 def digest(file: Path) -> str:
-    """The checksum by which `agent.py` knows a file again."""
+    """Returns a file's SHA-256, which `agent.py` compares."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def run_check(folder: Path) -> str:
-    """Runs `agent.py --check` in a process of its own; `ConfigError` with its message where it fails."""
+    """Runs `agent.py --check` in a process of its own; returns its line, or raises `ConfigError` with its message."""
     command = [sys.executable, str(folder / "agent.py"), "--check"]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT)
@@ -134,7 +134,7 @@ def _is_export(directory: Path) -> bool:
 
 
 def facts(stored: TrainedAgent) -> dict[str, Any]:
-    """What `agent.py` is told besides arrays; `ConfigError` for a sensor that it does not have."""
+    """Collects what `agent.py` is told besides arrays; `ConfigError` for a sensor that it does not know."""
     agent = stored.agent
     if isinstance(agent.config.sensor, OwnSensor):
         raise refuse("sensor.kind", agent.config.sensor.kind, ("rings", "logpolar"), why="cannot be exported")
@@ -168,13 +168,13 @@ def facts(stored: TrainedAgent) -> dict[str, Any]:
 
 
 def _normalisation(agent: Agent, statistics: FrameStatistics) -> str:
-    """Whose mean and deviation; while running ones have seen nothing, they are the frame's own."""
+    """Names what normalises a frame: the frame's own mean and deviation while running ones have seen none."""
     mode = agent.config.network.normalization
     return "frame" if mode in ("running", "pixel") and not statistics.weight > 0 else mode
 
 
 def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
-    """The gaze with its points moved within bounds; `moves` are what visual actions add, or where they look."""
+    """Describes the gaze, all points within bounds; `moves` are steps if `relative`, else focal points."""
     look, frame_shape = config.gaze, config.env.frame_shape
     low, high = gaze.limits(gaze=look, window=gaze.bounded(look, sensor), frame_shape=frame_shape)
     relative = look.moves == "steps"
@@ -191,9 +191,9 @@ def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
 
 
 def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
-    """What the sensor's arithmetic is made of: the mean of each channel, and weights that divide by the deviation.
+    """Tabulates what sensing needs: the mean of each channel, and weights that divide by the deviation too.
 
-    Sensing is linear: what it gives of a normalised frame is what it gives of the difference from the mean, weighted.
+    Sensing is linear, so that a normalised frame need not be made: its difference from the mean is sensed and weighted.
     """
     sensor, shape = agent.config.sensor, agent.config.env.frame_shape
     mean, std = np.zeros((*shape, *agent.config.env.pixel_shape), np.float32), 1.0
@@ -228,7 +228,7 @@ def arrays(agent: Agent, statistics: FrameStatistics) -> dict[str, np.ndarray]:
 
 
 def _provenance(stored: TrainedAgent, source: str, command: Sequence[str]) -> dict[str, Any]:
-    """Where the agent comes from; the training's commit is that of the run's last start, None of a shipped agent."""
+    """States where the agent comes from. `trained_with` is the commit of the run's last start, None if unknown."""
     return {
         "run": source,
         "env_steps": stored.env_steps,

@@ -1,4 +1,4 @@
-"""What the JAX agent does, recorded for the exported one to be compared with."""
+"""Records what the JAX agent does, to compare the exported one with it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from foajax.envs.gymnasium import make_frames
 from foajax.runs.agents import TrainedAgent
 from foajax.viewing import games
 
-STEPS, GAMES = 200, 2  # a second game begins half way, with memory and gaze reset
-_BLOCK = 5  # pixels of one colour in the images: noise would fill the folder
+STEPS, GAMES = 200, 2  # the second game begins half way, with memory and gaze reset
+_BLOCK = 5  # side of a block of one colour in the images: noise would make the file large
 
 
 def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
-    """The first `STEPS` / 2 greedy decisions of each of two games, one after the other; each array [STEPS, ...].
+    """Records the first `STEPS` / 2 greedy decisions of two games, one game after the other: arrays [STEPS, ...].
 
-    `frame` is what the environment shows, uint8, and `is_first` where memory and gaze begin anew. Further arrays
+    `frame` is what the environment shows, uint8; `is_first` says where memory and gaze begin anew. Further arrays
     `image_<i>` are colour images, uint8 [h, w, 3], and `frame_<i>` the frames that training would make of them.
 
     Raises:
@@ -47,7 +47,7 @@ def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def _images(env: EnvConfig, seed: int) -> dict[str, np.ndarray]:
-    """A camera's images, one a little and one much larger than the frame, in no whole proportion to it."""
+    """Makes two camera images, a little and much larger than the frame, by factors that are not whole."""
     frame_shape, random, arrays = env.frame_shape, np.random.default_rng(seed), {}
     for i, (height, width) in enumerate(((9, 3), (frame_shape[0] + 7, 2 * frame_shape[1] + 5))):
         size = frame_shape[0] + height, frame_shape[1] + width

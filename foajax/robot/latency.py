@@ -1,7 +1,7 @@
-"""What a decision costs on a robot: the exported folder of each experiment, timed beside JAX.
+"""Measures what a decision costs on a robot: times the exported folder of each experiment, and JAX beside it.
 
-A decision is everything from a screen (210x160) or a camera's image (1080x1920, colour) to the next focal point, one at
-a time, on one thread. Calls take turns, so that whatever else the machine does slows all alike.
+A decision goes from a screen (210x160) or a camera's image (1080x1920, colour) to the next focal point, one at a time,
+on one thread. Calls take turns, so that other load on the machine slows all of them alike.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from foajax.types import SCREEN_SHAPE, FrameStatistics, TimeStep
 
 PARTS = ("frame", "sense", "torso", "network", "screen", "camera", "jax_screen")
 _ACTIONS, _CROP_TOP, _IMAGE = 4, 34, (1080, 1920, 3)
-# Horowitz (ISSCC 2014), 45 nm: a 32-bit multiplication and addition, per operation; DRAM, per byte. For comparisons:
-# what a processor of today takes differs, and caches hold a part of what is read.
+# Horowitz (ISSCC 2014), 45 nm: a 32-bit multiplication and addition, per operation; DRAM, per byte. For comparisons
+# only: today's processors differ, and caches hold a part of what is read.
 _JOULES_PER_FLOP, _JOULES_PER_BYTE = 2.3e-12, 160e-12
 _PROCESS = """
 import sys, time, json
@@ -54,7 +54,7 @@ print(json.dumps({"start_s": seconds, "memory_mb": int(peak.split()[1]) / 1024})
 def measure(
     experiments: Sequence[str], *, torso: str, color: bool = False, dtype: str, repeats: int
 ) -> list[dict[str, Any]]:
-    """One record per experiment, and for `nonfoa`: times by `PARTS`, file, memory, start, and estimates of energy.
+    """Measures each experiment and `nonfoa`: times of `PARTS`, file size, memory, start, and estimates of energy.
 
     Times are medians and 99th percentiles in microseconds. `frame` makes a frame of a screen, `sense` looks at it,
     `torso` is a part of `network`; `screen` and `camera` are whole decisions, and `jax_screen` is JAX's.
@@ -94,7 +94,7 @@ def _measure(configs: Sequence[Config], dtype: str, repeats: int) -> list[dict[s
 
 
 def energy(flops: int, weight_bytes: int, image_bytes: int) -> float:
-    """An estimate, in joules: every operation, and every byte of weights and image read from memory once."""
+    """Estimates joules: of every operation, and of every byte of weights and image, read from memory once."""
     return flops * _JOULES_PER_FLOP + (weight_bytes + image_bytes) * _JOULES_PER_BYTE
 
 
@@ -110,7 +110,7 @@ def _untrained(config: Config) -> TrainedAgent:
 
 
 def _process(path: Path) -> dict[str, float]:
-    """Of a process of its own: seconds from the first import to the first decision, and megabytes."""
+    """Measures a process of its own: seconds from the first import to the first decision, and megabytes of memory."""
     ended = subprocess.run([sys.executable, "-c", _PROCESS, str(path)], capture_output=True, text=True, check=True)
     return json.loads(ended.stdout)
 

@@ -1,9 +1,9 @@
-"""The agent as a ROS 2 node: `python node.py --ros-args -p image:=/camera/image_raw`.
+"""Runs the agent as a ROS 2 node: `python node.py --ros-args -p image:=/camera/image_raw`.
 
 It listens to sensor_msgs/Image, or to CompressedImage with `-p compressed:=true`, and publishes each decision: the
 natural action's number (std_msgs/Int32) and where it looked, as (x, y) in [0, 1] of the image (geometry_msgs/Point).
 A message on the topic `reset` (std_msgs/Empty) begins an episode; one on `reward` (std_msgs/Float32) tells what the
-last action earned. Images that come sooner than `rate` asks for are left out.
+last action earned. Images that come faster than `rate` are skipped.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class AgentNode(Node):
         self.create_subscription(Float32, "reward", self.on_reward, 1)
 
     def on_image(self, message: Image | CompressedImage) -> None:
-        """Decides upon an image and publishes that, unless it comes too soon."""
+        """Decides upon an image and publishes the decision, unless the image comes too soon."""
         if time.monotonic() - self._last < EARLY * self.period:
             return
         try:
@@ -75,20 +75,21 @@ class AgentNode(Node):
         self._gaze.publish(Point(x=float(x), y=float(y), z=0.0))
         took = time.monotonic() - self._last
         if took > self.period:
-            self.get_logger().warning(f"a decision took {1e3 * took:.1f} ms, its period is {1e3 * self.period:.1f} ms")
+            period = f"longer than its period of {1e3 * self.period:.1f} ms"
+            self.get_logger().warning(f"a decision took {1e3 * took:.1f} ms, {period}")
 
     def on_reset(self, _: Empty) -> None:
-        """An episode begins: memory and gaze start anew."""
+        """Begins an episode: memory and gaze start anew."""
         self.agent.reset()
         self._reward = 0.0
 
     def on_reward(self, message: Float32) -> None:
-        """What the last action has earned; rewards between two decisions add up."""
+        """Takes what the last action has earned; rewards between two decisions add up."""
         self._reward += message.data
 
 
 def unpack(message: Image) -> tuple[np.ndarray, str]:
-    """An image message as uint8 [h, w] or [h, w, 3], without a copy where its rows are not padded; and its order.
+    """Returns the image, uint8 [h, w] or [h, w, 3], and its order of colours; copies it only if its rows are padded.
 
     Raises:
       AgentError: another encoding, or fewer bytes than its size says.
@@ -104,15 +105,15 @@ def unpack(message: Image) -> tuple[np.ndarray, str]:
 
 
 def decode(message: CompressedImage) -> tuple[np.ndarray, str]:
-    """A JPEG or PNG image as uint8 [h, w, 3], and its order; `AgentError` where OpenCV cannot decode it."""
+    """Decodes a JPEG or PNG image to uint8 [h, w, 3] and its order of colours; `AgentError` where OpenCV cannot."""
     image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR) if len(message.data) else None
     if image is None:
-        raise AgentError(f"format={message.format}: accepted is an image that OpenCV decodes")
+        raise AgentError(f"format={message.format}: cannot be decoded; accepted is a whole JPEG or PNG image")
     return image, "bgr"
 
 
 def main() -> int:
-    """The command, until ROS or Ctrl-C ends it."""
+    """Runs the node until ROS or Ctrl-C ends it; returns 1 after an error, else 0."""
     rclpy.init()
     node = None
     try:

@@ -1,8 +1,8 @@
-"""The network as an ONNX graph, written from its parameters: one decision, with the recurrent state in and out.
+"""Writes the network as an ONNX graph from its parameters: one decision, with the recurrent state in and out.
 
-Inputs: one image a sensor part, [batch, C, h, w], normalised; `side` [batch, S] where the core is told something
-beside the images; one state of the core each. Outputs: logits [batch, actions] and value [batch, 1] of each head, and
-the next state. The batch is free. Episodes are the caller's: a state of zeros begins one.
+Inputs: a normalised image [batch, C, h, w] per part of the sensor; `side` [batch, S], if the core is told something
+beside the images; the core's states. Outputs: logits [batch, actions] and value [batch, 1] of each head, and the next
+states. Any batch size works. The caller begins an episode with states of zeros.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ OPSET = 17  # the first with LayerNormalization; runtimes since 2022 have it
 _IR_VERSION = 8  # of the same year
 _EPSILON = 1e-6  # of Flax's layer norm
 _FLOAT = TensorProto.FLOAT
+_ACCEPTED = "those of the network in its config.yaml"
 
 
 class Graph:
-    """Collects nodes and constants. Each method gives the name of the value that it adds."""
+    """Collects nodes and constants. Each method that adds a value returns its name."""
 
     def __init__(self, params: Mapping[str, Any]) -> None:
         self._params = named(params)
@@ -41,17 +42,17 @@ class Graph:
         self.outputs: list[onnx.ValueInfoProto] = []
 
     def take(self, path: str) -> np.ndarray:
-        """A parameter by its path, e.g. `dense/kernel`; each is taken once."""
+        """Takes a parameter by its path, such as `dense/kernel`. Each can be taken once."""
         if path not in self._params:
-            raise refuse("network", accepted="a network as its config.yaml has it", why=f"has no {path}")
+            raise refuse("parameters", accepted=_ACCEPTED, why=f"{path} is missing")
         return self._params.pop(path)
 
     def left_over(self) -> list[str]:
-        """The parameters that nothing took."""
+        """Lists the parameters that nothing has taken."""
         return list(self._params)
 
     def has(self, path: str) -> bool:
-        """Whether a parameter is there to be taken."""
+        """Whether a parameter can be taken."""
         return path in self._params
 
     def input(self, name: str, *shape: int) -> str:
@@ -60,49 +61,48 @@ class Graph:
         return name
 
     def output(self, name: str, *shape: int) -> str:
-        """Names an output [batch, *shape]; a node of that name gives it."""
+        """Declares an output [batch, *shape], which the node of that name gives."""
         self.outputs.append(helper.make_tensor_value_info(name, _FLOAT, ["batch", *shape]))
         return name
 
     def constant(self, name: str, array: np.ndarray) -> str:
-        """Adds a constant."""
         self.constants.append(numpy_helper.from_array(np.ascontiguousarray(array), name))
         return name
 
     def node(self, kind: str, name: str, *inputs: str, **attributes: Any) -> str:
-        """Adds a node with one output, which bears its name."""
+        """Adds a node with one output of the same name."""
         self.nodes.append(helper.make_node(kind, list(inputs), [name], name=name, **attributes))
         return name
 
     def dense(self, name: str, x: str, order: np.ndarray | None = None) -> str:
-        """A dense layer; `order` says which of its rows takes each feature of `x`."""
+        """Adds a dense layer; feature i of `x` meets row `order[i]` of its kernel."""
         rows = self.take(f"{name}/kernel")
         kernel = self.constant(f"{name}.kernel", rows if order is None else rows[order])
         return self.node("Gemm", name, x, kernel, self.constant(f"{name}.bias", self.take(f"{name}/bias")))
 
     def product(self, name: str, x: str) -> str:
-        """A matrix product with a parameter."""
+        """Adds a matrix product with a parameter."""
         return self.node("MatMul", name, x, self.constant(f"{name}.kernel", self.take(name)))
 
     def split(self, name: str, x: str, names: Sequence[str], width: int) -> list[str]:
-        """The parts of the last axis, each of `width`."""
+        """Splits the last axis into `names`, each of `width`."""
         sizes = self.constant(f"{name}.widths", np.full(len(names), width, np.int64))
         self.nodes.append(helper.make_node("Split", [x, sizes], list(names), name=f"{name}.split", axis=-1))
         return list(names)
 
     def layer_norm(self, name: str, x: str, width: int) -> str:
-        """A layer norm over the last axis, scaled and shifted where the network has learned to."""
+        """Adds a layer norm over the last axis, with a scale and a shift where the network has them."""
         scale = self.take(f"{name}/scale") if self.has(f"{name}/scale") else np.ones(width, np.float32)
         shift = [self.constant(f"{name}.bias", self.take(f"{name}/bias"))] if self.has(f"{name}/bias") else []
         parts = [x, self.constant(f"{name}.scale", scale), *shift]
         return self.node("LayerNormalization", name, *parts, axis=-1, epsilon=_EPSILON)
 
     def channels(self, name: str) -> int:
-        """How many channels a convolution, not yet added, gives."""
+        """Returns the number of channels that a convolution will give; call it before adding that."""
         return len(self._params.get(f"{name}/bias", ()))
 
     def convolution(self, name: str, x: str, *, stride: int = 1, pads: Sequence[int] = (0, 0, 0, 0)) -> str:
-        """A convolution; `pads` are rows and columns of zeros above, left, below and right."""
+        """Adds a convolution; `pads` are rows and columns of zeros above, left, below and right."""
         kernel = self.take(f"{name}/kernel").transpose(3, 2, 0, 1)
         weights = self.constant(f"{name}.kernel", kernel), self.constant(f"{name}.bias", self.take(f"{name}/bias"))
         shape = {"kernel_shape": list(kernel.shape[2:]), "strides": [stride, stride], "pads": list(pads)}
@@ -115,10 +115,10 @@ Torso = Callable[[Graph, NetworkConfig, str, str, Image], tuple[str, Image]]
 
 
 def policy(agent: Agent, params: Params, facts: Mapping[str, str]) -> onnx.ModelProto:
-    """The network of an agent with its parameters; `facts` are written into the file for whoever opens it.
+    """Makes an ONNX model of an agent's network and its parameters, with `facts` as metadata.
 
     Raises:
-      ConfigError: the network has a part that this module does not know.
+      ConfigError: the network has a part that this module does not know, or other parameters.
     """
     config = agent.config.network
     graph = Graph(params["params"])
@@ -134,12 +134,12 @@ def policy(agent: Agent, params: Params, facts: Mapping[str, str]) -> onnx.Model
         last = f"image_{len(agent.image_shapes) - 1}"
         _head(graph, "vision", hidden, _priority(graph, last, hidden) if config.priority_map else None)
     if graph.left_over():
-        raise refuse("network", accepted="a network as its config.yaml has it", why=f"has {graph.left_over()[0]} too")
+        raise refuse("parameters", accepted=_ACCEPTED, why=f"the network has no {graph.left_over()[0]}")
     return _model(graph, facts)
 
 
 def side_width(agent: Agent) -> int:
-    """How many numbers the core is told beside the images."""
+    """Counts the numbers that the core is told beside the images."""
     integers, numbers = jnp.zeros((1, 2), jnp.int32), jnp.zeros(1)
     return jax.eval_shape(agent.side, integers, integers, numbers, jnp.zeros(1, bool)).shape[-1]
 
@@ -155,9 +155,9 @@ def _model(graph: Graph, facts: Mapping[str, str]) -> onnx.ModelProto:
 
 
 def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> tuple[str, np.ndarray]:
-    """Torso on every image, concatenated; then the dense layer if there is one.
+    """Adds a torso per image, joins the features and adds the dense layer, if there is one.
 
-    Gives a value [batch, F] and the place of each of its numbers in the network's order.
+    Returns the value [batch, F] and the place of each of its numbers in the network's order.
     """
     write_torso = _known("network.torso", config.torso, TORSOS)
     names, orders, start = [], [], 0
@@ -166,7 +166,7 @@ def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> t
         if min(shape[:2]) >= smallest_image(config.torso):
             name, shape = write_torso(graph, config, f"torso_{i}", name, shape)
         names.append(graph.node("Flatten", f"features_{i}", name, axis=1))
-        # ONNX lays channels first, the network had them last: the rows of the next kernel are sorted anew.
+        # ONNX puts channels first, the network has them last: the rows of the next kernel are sorted anew.
         orders.append(start + np.arange(np.prod(shape)).reshape(shape).transpose(2, 0, 1).ravel())
         start += int(np.prod(shape))
     x = graph.node("Concat", "features", *names, axis=-1) if len(names) > 1 else names[0]
@@ -179,7 +179,7 @@ def _features(graph: Graph, config: NetworkConfig, shapes: Sequence[Image]) -> t
 
 
 def _nature(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -> tuple[str, Image]:
-    """`torsos.NatureTorso`."""
+    """Adds a `torsos.NatureTorso`."""
     height, width, channels = shape
     first = (8, 4) if min(height, width) >= 44 else (4, 2)
     covers = config.padding == "cover"
@@ -197,7 +197,7 @@ def _nature(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image
 
 
 def _a3c(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -> tuple[str, Image]:
-    """`torsos.A3CTorso`."""
+    """Adds a `torsos.A3CTorso`."""
     height, width, channels = shape
     for layer, (kernel, border) in enumerate(((5, 2), (5, 1), (4, 1), (3, 1))):
         channels = graph.channels(f"{name}/Convolution_{layer}")
@@ -211,7 +211,7 @@ def _a3c(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -
 
 
 def _impala(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -> tuple[str, Image]:
-    """`torsos.ImpalaTorso`; each of its convolutions keeps the image's size."""
+    """Adds a `torsos.ImpalaTorso`, whose convolutions keep the image's size."""
     height, width, channels = shape
     layers = itertools.count()
 
@@ -221,7 +221,7 @@ def _impala(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image
     part = 0
     while graph.has(f"{name}/Conv_{5 * part}/kernel"):
         channels = graph.channels(f"{name}/Conv_{5 * part}")
-        # 'SAME' as Flax has it: what is missing is added below and on the right first.
+        # 'SAME' as in Flax: an odd row or column of zeros goes below or to the right.
         missing = [max(2 * (-(-size // 2) - 1) + 3 - size, 0) for size in (height, width)]
         pads = [m // 2 for m in missing] + [m - m // 2 for m in missing]
         pool = {"kernel_shape": [3, 3], "strides": [2, 2], "pads": pads}
@@ -235,7 +235,7 @@ def _impala(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image
 
 
 def _small(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image) -> tuple[str, Image]:
-    """`torsos.SmallTorso`."""
+    """Adds a `torsos.SmallTorso`."""
     height, width, channels = shape
     for layer, kernel in enumerate((4, 3)):
         below, right = -(height - kernel) % 2, -(width - kernel) % 2
@@ -247,9 +247,9 @@ def _small(graph: Graph, config: NetworkConfig, name: str, x: str, shape: Image)
 
 
 def _lstm(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str:
-    """One step of `cores.LSTM`, with its gates in the order input, forget, candidate, output.
+    """Adds one step of `cores.LSTM`, with its gates in the order input, forget, candidate, output.
 
-    Not ONNX's LSTM: it has no place for the norm between the input's product and the gates.
+    ONNX's own LSTM has no place for the norm between the input's product and the gates.
     """
     cell, hidden = (graph.input(state, config.lstm) for state in ("cell", "hidden"))
     projected = _projected(graph, config, x, order, gates=4, prefix="lstm_")
@@ -264,7 +264,7 @@ def _lstm(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str
 
 
 def _gru(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str:
-    """One step of `cores.GRU`, with the reset gate after the recurrent product."""
+    """Adds one step of `cores.GRU`, with the reset gate after the recurrent product."""
     hidden = graph.input("hidden", config.lstm)
     projected = _projected(graph, config, x, order, gates=3, prefix="core/")
     reset, keep, new = graph.split("from_input", projected, ["reset", "keep", "candidate"], config.lstm)
@@ -278,7 +278,7 @@ def _gru(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str:
 
 
 def _mingru(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str:
-    """One step of `cores.MinGRU`."""
+    """Adds one step of `cores.MinGRU`."""
     hidden = graph.input("hidden", config.lstm)
     projected = _projected(graph, config, x, order, gates=2, prefix="core/")
     keep, candidate = graph.split("from_input", projected, ["keep", "candidate"], config.lstm)
@@ -286,12 +286,12 @@ def _mingru(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> s
 
 
 def _memoryless(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray) -> str:
-    """`cores.Memoryless`: no state."""
+    """Adds a `cores.Memoryless`, which has no state."""
     return graph.node("Relu", "core", _projected(graph, config, x, order, gates=1, prefix="core/"))
 
 
 def _mixed(graph: Graph, config: NetworkConfig, keep: str, hidden: str, candidate: str) -> str:
-    """The next state: so much is kept, the rest is new."""
+    """Adds the next state: sigmoid(keep) of `hidden`, the rest of `candidate`."""
     keep = graph.node("Sigmoid", "keep_gate", keep)
     rest = graph.node("Sub", "rest", graph.constant("one", np.ones((), np.float32)), keep)
     kept, new = graph.node("Mul", "kept", keep, hidden), graph.node("Mul", "new", rest, candidate)
@@ -299,13 +299,13 @@ def _mixed(graph: Graph, config: NetworkConfig, keep: str, hidden: str, candidat
 
 
 def _projected(graph: Graph, config: NetworkConfig, x: str, order: np.ndarray, *, gates: int, prefix: str) -> str:
-    """The input's part of a core's gates."""
+    """Adds the input's part of a core's gates."""
     projected = graph.dense(f"{prefix}input", x, order)
     return graph.layer_norm(f"{prefix}norm", projected, gates * config.lstm) if config.lstm_norm else projected
 
 
 def _priority(graph: Graph, cells: str, hidden: str) -> str:
-    """What `Network.priority` adds to the logits of the vision head, [batch, cells]."""
+    """Adds what `Network.priority` gives to the logits of the vision head, [batch, cells]."""
     near = graph.node("Relu", "map_relu", graph.convolution("map_near", cells, pads=(1,) * 4))
     flat = graph.node("Reshape", "map_flat", near, graph.constant("map_flat.shape", np.array([0, 0, -1])))
     kernel, bias = graph.take("map_keys/kernel").T, graph.take("map_keys/bias")[:, None]
@@ -319,7 +319,7 @@ def _priority(graph: Graph, cells: str, hidden: str) -> str:
 
 
 def _head(graph: Graph, name: str, hidden: str, more: str | None = None) -> None:
-    """Logits, to which `more` is added, and value."""
+    """Adds a head: its logits, plus `more`, and its value."""
     for part, output in (("policy", "logits"), ("value", "value")):
         kernel, bias = graph.take(f"{name}_{part}/kernel"), graph.take(f"{name}_{part}/bias")
         weights = graph.constant(f"{name}_{part}.kernel", kernel), graph.constant(f"{name}_{part}.bias", bias)
@@ -331,8 +331,8 @@ def _head(graph: Graph, name: str, hidden: str, more: str | None = None) -> None
 
 
 TORSOS: dict[str, Torso] = {"nature": _nature, "a3c": _a3c, "impala": _impala, "small": _small}
-# A core makes one step: it takes the value that the images have become, adds an input for each of its states and an
-# output `next_<state>` for each, and gives the value that the heads read.
+# A core adds one step: it reads the features, adds an input and an output `next_<state>` for each of its states, and
+# returns the value that the heads read.
 CORES: dict[str, Core] = {"lstm": _lstm, "gru": _gru, "mingru": _mingru, "none": _memoryless}
 
 

@@ -11,11 +11,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 _LARGE = 1024  # values; smaller constants, biases and scales among them, stay as they are
 # Convolutions are left out: their kernels are small, and ONNX Runtime's integer convolution takes longer on a CPU.
-_QUANTISED = ["MatMul"]  # of which a Gemm becomes one, and an addition
+_QUANTISED = ["MatMul"]  # the quantiser makes one, and an addition, of each Gemm
 
 
 def float16(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Weights stored in 16 bits and cast once, when the file is loaded: half the file, the same time."""
+    """Stores weights in 16 bits, which are cast once, when the file is loaded: half the file, the same time."""
     small = onnx.ModelProto()
     small.CopyFrom(model)
     graph, casts, kept = small.graph, [], []
@@ -35,7 +35,7 @@ def float16(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def int8(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Matrix products in 8 bits, inputs quantised as they come: a third of the file, four fifths of the time."""
+    """Multiplies matrices in 8 bits and quantises inputs as they come: a third of the file, four fifths of the time."""
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     with tempfile.TemporaryDirectory() as directory:

@@ -1,6 +1,6 @@
-"""The whole decision as one StableHLO program: screen, sensor, network, gaze; for CPUs and CUDA, for any batch.
+"""Writes the whole decision as one StableHLO program, from the screen to the gaze, for CPUs, CUDA and any batch.
 
-JAX alone runs it, where `out/decide.stablehlo` is the file's bytes:
+JAX alone runs it; `data` are the bytes of `decide.stablehlo`:
 
     decide = jax.jit(jax.export.deserialize(bytearray(data)).call)
     outputs = decide(inputs)
@@ -33,7 +33,7 @@ Arrays = dict[str, Any]
 
 
 def serialise(stored: TrainedAgent) -> bytes:
-    """The program, with parameters and frame statistics in it.
+    """Returns the program as bytes, with parameters and frame statistics in it.
 
     Its outputs are `natural_action`, `vision_action`, their logits, `looked_at`, and the next state.
     """
@@ -51,11 +51,11 @@ def serialise(stored: TrainedAgent) -> bytes:
 
 
 def inputs(agent: Agent, batch: int) -> Arrays:
-    """Inputs of zeros, before the first episode.
+    """Makes the inputs of a first step, with frames of zeros.
 
-    `frame` is what the environment shows, `reward` what the last action earned, `is_first` whether an episode begins
-    (the state is not read then), `seed` that of what is drawn at this step, `greedy` whether nothing is drawn; the
-    others are the state.
+    `frame` is what the environment shows, `reward` what the last action earned. With `is_first` an episode begins, and
+    the state is not read. `seed` is for the actions drawn at this step; with `greedy` none is drawn. The other inputs
+    are the state.
     """
     given: Arrays = {
         "frame": np.zeros((batch, *agent.screen_shape), np.uint8),
@@ -68,7 +68,7 @@ def inputs(agent: Agent, batch: int) -> Arrays:
 
 
 def check(data: bytes, golden: Arrays, agent: Agent) -> float:
-    """Replays recorded games beside each other, in one batch; gives the largest difference of logits.
+    """Replays the recorded games as one batch; returns the largest difference of logits.
 
     Raises:
       ConfigError: logits differ by more than `TOLERANCE`, or actions or focal points differ.
@@ -121,7 +121,7 @@ def _decide(stored: TrainedAgent, given: Arrays) -> Arrays:
 
 
 def _named(state: ActorState) -> Arrays:
-    """The state as one mapping."""
+    """Returns the state as a mapping of inputs."""
     core = {f"core_{i}": leaf for i, leaf in enumerate(jax.tree.leaves(state.core_state))}
     others = {name: getattr(state, name) for name in ("focal_point", "age", "last_actions", "owed")}
     return core | {name: value for name, value in others.items() if value is not None}

@@ -1,1 +1,1 @@
-"""Recorded games and their pictures: videos, heat maps, pages."""
+"""Records games and makes pictures of them: videos, heat maps, pages."""

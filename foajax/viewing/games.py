@@ -1,4 +1,4 @@
-"""Whole games of a trained agent with fixed parameters, for their scores."""
+"""Plays whole games with a trained agent, whose parameters stay fixed, for its scores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from foajax.envs.measures import Facts, pooled
 from foajax.runs.agents import TrainedAgent
 
 _SEEDS = 2**31  # seeds to choose from
-_WATCHED = 1_000_003  # keeps what `np.random.SeedSequence` makes of them apart from the seeds of training
+_WATCHED = 1_000_003  # mixed into them by `np.random.SeedSequence`, so that they differ from the seeds of training
 
 
 class Games(NamedTuple):
@@ -25,21 +25,21 @@ class Games(NamedTuple):
     returns: np.ndarray  # [episodes] unclipped
     lengths: np.ndarray  # [episodes] agent steps
     cut: int  # how many of them reached `env.max_episode_steps`
-    facts: Facts = {}  # about each, where the task tells any (`foajax.envs.measures`)
+    facts: Facts = {}  # about each game, where the task tells any (`foajax.envs.measures`)
 
 
 def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool = False) -> Environment:
-    """What an agent is watched in: the game that it was trained in, with seeds apart from those of training.
+    """Makes the game that an agent was trained in, with seeds that training does not use.
 
-    Scenes of visual search are all as they shall be found, without the staircase that training may begin with.
+    Visual search has no staircase here: scenes are as hard as `search` says from the first one on.
 
     Raises:
-      ConfigError: a seed out of range; no such game, or one whose actions are no longer those of the training.
+      ConfigError: a seed out of range; no such game; a game with another number of actions than in training.
     """
     if not 0 <= seed < _SEEDS:
         raise refuse("seed", seed, f"an integer from 0 to {_SEEDS - 1}")
     config, actions = stored.agent.config, stored.agent.num_actions
-    # An engine adds an environment's number to its seed: neighbouring seeds may not lie side by side.
+    # An engine adds an environment's number to its seed, so neighbouring seeds are moved far apart.
     first = int(np.random.SeedSequence([_WATCHED, seed]).generate_state(1)[0] >> 2)
     config = replace(config, search=replace(config.search, staircase=False))
     made = make(config, num_envs=num_envs, seed=first, render=render)
@@ -58,9 +58,9 @@ def play(
     greedy: bool,
     progress: Callable[[int], None] | None = None,
 ) -> Games:
-    """Plays `episodes` games with fixed parameters; `progress` is told how many have ended, after each step.
+    """Plays `episodes` games with fixed parameters; after each step, tells `progress` how many have ended.
 
-    Every environment plays the same number of games, to within one, so that short games are not over-represented.
+    Every environment plays the same number of games, or one less, so that short games are not over-represented.
     """
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]

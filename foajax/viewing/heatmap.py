@@ -1,4 +1,4 @@
-"""Where an agent looks: counts of the focal point over whole games (the paper's Fig. 10)."""
+"""Counts and draws where an agent looks: its focal points over whole games (the paper's Fig. 10)."""
 
 from __future__ import annotations
 
@@ -38,25 +38,24 @@ class HeatMap:
     low: Int[np.ndarray, "2"]  # the smallest and the largest focal point (y, x) that the gaze may have
     high: Int[np.ndarray, "2"]
     games: int
-    # Whose gaze it is; None where a file is from before this was kept.
+    # Whose gaze it is; None where an older file does not say so.
     env_steps: int | None = None  # the agent had been trained for
     policy: str | None = None  # "sampled" or "greedy"
     whole_games: bool | None = None  # False where one was cut
 
     @property
     def steps(self) -> int:
-        """Decisions counted."""
         return int(self.counts.sum())
 
     @property
     def entropy(self) -> float:
-        """Of the focal point's distribution, in bits: 0 for a gaze that never moves."""
+        """Entropy of the focal point's distribution, in bits: 0 for a gaze that never moves."""
         shares = self.counts[self.counts > 0] / self.steps
         return float(abs((shares * np.log2(shares)).sum()))
 
     @property
     def share_at_bounds(self) -> float:
-        """Share of the steps at which the gaze could not have gone further, along either axis."""
+        """Share of the steps at which the focal point was at a bound, along either axis."""
         y, x = np.nonzero(self.counts)
         points = np.stack([y, x], axis=-1)
         at_bounds = ((points == self.low) | (points == self.high)).any(axis=-1)
@@ -69,25 +68,25 @@ class HeatMap:
 
     @property
     def spread(self) -> float:
-        """Distance from the mean focal point, root mean square, in frame pixels."""
+        """Root mean square distance from the mean focal point, in frame pixels."""
         return _spread(self.counts)
 
     @property
     def relative_spread(self) -> float:
-        """`spread` over that of a gaze that is everywhere within its bounds equally often; 0 where it has no room."""
+        """`spread` divided by that of a gaze spread evenly within its bounds; 0 if the bounds leave no room."""
         even = np.zeros_like(self.counts)
         even[self.low[0] : self.high[0] + 1, self.low[1] : self.high[1] + 1] = 1
         return self.spread / most if (most := _spread(even)) else 0.0
 
     @property
     def summary(self) -> str:
-        """The numbers in one line."""
+        """The main numbers in one line."""
         games = f"{self.games} game{'s' if self.games > 1 else ''}"
         share = f"{100 * self.share_at_bounds:.0f} % at the bounds"
         return f"{self.steps:,} steps of {games}, {self.entropy:.2f} bits, {share}"
 
     def to_json(self) -> dict[str, Any]:
-        """All of it, as plain values."""
+        """Returns plain values for JSON."""
         return {
             "steps": self.steps,
             "games": self.games,
@@ -104,7 +103,7 @@ class HeatMap:
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> HeatMap:
-        """The inverse of `to_json`."""
+        """Makes a heat map of what `to_json` returned."""
         fields: dict[str, Any] = {key: np.array(record[key]) for key in ("counts", "mean_frame", "low", "high")}
         fields |= {key: record.get(key) for key in ("env_steps", "policy", "whole_games")}
         return cls(games=record["games"], **fields)
@@ -118,7 +117,7 @@ def _spread(counts: Int[np.ndarray, "H W"]) -> float:
 
 
 def heat_map(recordings: Sequence[Recording]) -> HeatMap:
-    """Counts over games of one agent."""
+    """Counts the focal points of games of one agent."""
     config, env_steps = recordings[0].config, recordings[0].env_steps
     lengths = [len(each.focal_point) for each in recordings]
     mean = np.average([each.mean_frame for each in recordings], axis=0, weights=lengths)
@@ -131,7 +130,7 @@ def heat_map(recordings: Sequence[Recording]) -> HeatMap:
 
 
 def bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest focal point (y, x) of an agent."""
+    """Returns the smallest and the largest focal point (y, x) that an agent can have."""
     window = gaze.bounded(config.gaze, make_sensor(config.sensor))
     return gaze.limits(gaze=config.gaze, window=window, frame_shape=config.env.frame_shape)
 
@@ -143,7 +142,7 @@ def save(heat: HeatMap, directory: Path, title: str) -> None:
 
 
 def read(file: Path) -> HeatMap:
-    """What `save` wrote.
+    """Reads the JSON file that `save` wrote.
 
     Raises:
       ConfigError: the file is something else.
@@ -151,11 +150,11 @@ def read(file: Path) -> HeatMap:
     try:
         return HeatMap.from_json(json.loads(file.read_text()))
     except (OSError, ValueError, KeyError, TypeError):
-        raise refuse(str(file), accepted="", why="is no heat map; remove it") from None
+        raise refuse(str(file), accepted="", why="is no heat map of foajax render; remove it") from None
 
 
 def of_run(path: Path, env_steps: int) -> HeatMap | None:
-    """What `render` left in a run's directory, where it is of whole games with sampled actions at `env_steps`."""
+    """Reads a run's heat map, if `render` made it from whole games with sampled actions at `env_steps`."""
     file = path / "render" / FILE
     heat = read(file) if file.exists() else None
     said = heat and (heat.env_steps, heat.policy, heat.whole_games)
@@ -163,7 +162,7 @@ def of_run(path: Path, env_steps: int) -> HeatMap | None:
 
 
 def draw(heat: HeatMap, title: str) -> Figure:
-    """The counts over the mean frame; where the gaze has little room, that room enlarged beside it."""
+    """Draws the counts over the mean frame; beside it, where the gaze has little room, that room enlarged."""
     room = int(np.prod(heat.high - heat.low + 1))
     zoomed = 1 < room < _ZOOM * heat.counts.size
     with rc_context(STYLE):
@@ -174,7 +173,7 @@ def draw(heat: HeatMap, title: str) -> Figure:
         norm = LogNorm(vmin=low if low < high else high / 10, vmax=high)
         white = float(heat.mean_frame.max()) or 1.0
         for axis in axes:
-            # Lighter than it is, so that cells stand out from a black frame.
+            # The frame is lightened, so that dark cells stand out from black.
             axis.imshow(0.2 + 0.6 * heat.mean_frame / white, cmap="gray", vmin=0, vmax=1)
             image = axis.imshow(shares, cmap=ListedColormap(_COLOURS), norm=norm)
         _mark_bounds(axes[0], heat)
@@ -195,7 +194,6 @@ def draw(heat: HeatMap, title: str) -> Figure:
 
 
 def _mark_bounds(axis: Any, heat: HeatMap) -> None:
-    """Where the focal point may be."""
     top, left = heat.low - 0.5
     height, width = heat.high - heat.low + 1
     axis.add_patch(Rectangle((left, top), width, height, fill=False, edgecolor="white", linestyle=":", linewidth=1))

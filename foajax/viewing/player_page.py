@@ -1,9 +1,9 @@
-"""One recorded game as a page to play, scrub and study.
+"""Writes one recorded game as a page to play, scrub and study.
 
-The page is one file and needs nothing else, no network and no server. Screens are palette indices; 60 at a time, each
-XORed with the one before it, go through zlib, which every browser undoes by itself: a step of an Atari game takes
-some hundred bytes, and any step is on the screen some milliseconds after it is asked for. (A video would be smaller
-for games in full motion; a browser cannot show any frame of one at once, nor exactly.)
+The page is one file and needs no other, no network and no server. Screens are palette indices. 60 screens at a time
+are compressed with zlib, which browsers can undo, each XORed with the one before. So a step of an Atari game takes some
+hundred bytes, and any step can be shown within milliseconds. A video would be smaller for games in full motion, but a
+browser could not jump to any of its frames at once, nor show it exactly.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from foajax.sensors.registry import make_sensor
 from foajax.viewing.recording import Recording
 
 PAGE = "index.html"
-_PART = 60  # steps that are compressed together; what has to be undone to show one of them
-_MOST_PIXELS = 48_000  # of a screen; a larger one than an Atari's is made smaller
+_PART = 60  # steps that are compressed together; to show one, all are decompressed
+_MOST_PIXELS = 48_000  # of a screen; larger ones are shrunk, which spares an Atari's
 _COLOURS = 256
 
 
@@ -44,7 +44,7 @@ def write_page(recording: Recording, directory: Path) -> Path:
 
 
 def encode(recording: Recording) -> dict[str, Any]:
-    """All of a recording, as the page's script reads it."""
+    """Encodes a recording for the page's script."""
     config, sensor = recording.config, make_sensor(recording.config.sensor).packed
     palette, screens = _screens(recording)
     values = recording.values
@@ -78,7 +78,7 @@ def encode(recording: Recording) -> dict[str, Any]:
 
 
 def _columns(recording: Recording) -> dict[str, tuple[str, str]]:
-    """Type and content of what a step has one or a few numbers of."""
+    """Packs what has a few numbers per step; returns type and content by name."""
     columns: dict[str, np.ndarray] = {
         "focal_point": recording.focal_point.astype(np.int16),
         "natural_probs": np.round(255 * recording.natural_probs).astype(np.uint8),
@@ -102,7 +102,7 @@ def _pack(values: np.ndarray) -> str:
 
 
 def _screens(recording: Recording) -> tuple[list[list[int]], Iterator[str]]:
-    """A palette for the whole game, and the screens part by part."""
+    """Returns a palette for the whole game, and its screens part by part."""
     palette = _exact_palette(recording) if _shrunk(recording) == recording.screens.shape[:2] else None
     if palette is not None:
         index = np.zeros(1 << 24, np.uint8)
@@ -117,7 +117,7 @@ def _screens(recording: Recording) -> tuple[list[list[int]], Iterator[str]]:
 
 
 def _parts(screens: Iterator[np.ndarray]) -> Iterator[str]:
-    """Indices [h, w] of one screen after the other, XORed with the one before, `_PART` at a time."""
+    """Packs screens of indices [h, w], `_PART` at a time, each XORed with the one before."""
     while some := list(itertools.islice(screens, _PART)):
         part = np.stack(some)
         part[1:] ^= part[:-1].copy()
@@ -125,7 +125,7 @@ def _parts(screens: Iterator[np.ndarray]) -> Iterator[str]:
 
 
 def _exact_palette(recording: Recording) -> np.ndarray | None:
-    """The game's colours, 0xrrggbb, if they are few enough; an emulator has 128."""
+    """Lists the game's colours, 0xrrggbb, if a palette can hold them; an emulator has 128."""
     seen = np.zeros(1 << 24, bool)
     for screen in recording.screens:
         seen[_codes(screen)] = True
@@ -139,7 +139,7 @@ def _codes(screen: np.ndarray) -> np.ndarray:
 
 
 def _chosen_palette(recording: Recording) -> Image.Image:
-    """256 colours that suit sixteen screens of the game."""
+    """Chooses 256 colours that suit sixteen screens of the game."""
     some = np.linspace(0, len(recording.screens) - 1, 16).astype(int)
     sheet = np.concatenate([np.asarray(_small(recording, int(i))) for i in some])
     return Image.fromarray(sheet).quantize(_COLOURS)
@@ -151,7 +151,7 @@ def _small(recording: Recording, index: int) -> Image.Image:
 
 
 def _shrunk(recording: Recording) -> tuple[int, int]:
-    """Rows and columns of a screen on the page."""
+    """Returns rows and columns of a screen on the page."""
     height, width = recording.screens.shape[:2]
     scale = min(1.0, (_MOST_PIXELS / (height * width)) ** 0.5)
     return round(scale * height), round(scale * width)

@@ -1,4 +1,4 @@
-"""What a training run shows of its gaze now and then: two small images from one rollout, for TensorBoard."""
+"""Draws two small images of the gaze from one rollout, which training sends to TensorBoard."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _GAP = 2
 
 
 def snapshots(rollout: Rollout, frame_shape: tuple[int, int]) -> dict[str, UInt8[np.ndarray, "_ _ *C"]]:
-    """A heat map of the focal points of all environments, and what the first of them saw, by TensorBoard's names."""
+    """Draws a heat map of all environments' focal points, and what the first one saw, by TensorBoard's names."""
     steps = rollout.steps
     return {
         "gaze/heat_map": heat_map(np.asarray(steps.focal_point).reshape(-1, 2), frame_shape),
@@ -23,16 +23,16 @@ def snapshots(rollout: Rollout, frame_shape: tuple[int, int]) -> dict[str, UInt8
 
 
 def heat_map(points: Int[np.ndarray, "n 2"], frame_shape: tuple[int, int]) -> UInt8[np.ndarray, "_ _"]:
-    """How often the focal point was where: logarithmic, white for the most, on dark gray."""
+    """Draws how often the focal point was where: logarithmic, the most white, on dark gray."""
     counts = gaze.count(points, frame_shape)
     levels = np.where(counts > 0, 80 + 175 * np.log1p(counts) / np.log1p(counts.max()), 24)
     return _enlarged(levels)
 
 
 def views(parts: list[Float[np.ndarray, "T _ _ C"]]) -> UInt8[np.ndarray, "_ _ C"]:
-    """The sensor's images at a few steps, left to right, the parts of each below one another.
+    """Draws the sensor's images at a few steps: a column per step, its parts below one another.
 
-    Values are normalised frames: the darkest is drawn black and the brightest white.
+    Values are of normalised frames; the smallest is drawn black and the largest white.
     """
     chosen = np.linspace(0, len(parts[0]) - 1, _VIEWS).astype(int)
     low, high = (bound(np.stack([bound(part[chosen]) for part in parts])) for bound in (np.min, np.max))

@@ -1,4 +1,4 @@
-"""Whole games of a trained agent, with all that it saw, thought and did. What every picture is made from."""
+"""Records whole games of a trained agent, with all that it saw, expected and did; every picture is made from these."""
 
 from __future__ import annotations
 
@@ -36,7 +36,6 @@ class Screens(Sequence):
         self.shape: tuple[int, ...] = (0, 0, 3)  # of each
 
     def append(self, screen: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Adds one."""
         self.shape = screen.shape
         self._packed.append(zlib.compress(screen.tobytes(), 1))
 
@@ -50,7 +49,7 @@ class Screens(Sequence):
 
 
 class Recording(NamedTuple):
-    """One game, from its first screen to its last: N of them, and N decisions.
+    """One game, from its first screen to its last: N screens and N decisions.
 
     Row t is what was seen at t and what was decided upon it. `score` includes what the action at t - 1
     earned. The action decided at the last row of a life or of the game has no effect.
@@ -81,13 +80,13 @@ class Recording(NamedTuple):
 
     @property
     def values(self) -> UInt8[np.ndarray, "N n *C"]:
-        """All images of each step, laid end to end."""
+        """The values of all images of each step, one after the other."""
         parts = [part.reshape(len(part), -1, *self.config.env.pixel_shape) for part in self.images]
         return np.concatenate(parts, axis=1)
 
     @property
     def white(self) -> int:
-        """The largest of `values`, at least 1: drawn white throughout the game, so that nothing flickers."""
+        """The largest of `values`, at least 1. It is drawn white throughout the game, so that nothing flickers."""
         return max(1, *(int(part.max()) for part in self.images))
 
     @property
@@ -97,20 +96,20 @@ class Recording(NamedTuple):
 
     @property
     def about(self) -> str:
-        """How the agent came to play like this, in one line."""
+        """The agent's training, its policy and the game's seed, in one line."""
         policy = "likeliest actions" if self.greedy else "sampled actions"
         return f"{self.env_steps:,} env_steps of training, {policy}, game {self.seed}"
 
     @property
     def life_lost(self) -> np.ndarray:
-        """Bool [N]: the steps at which the game has a life fewer than before."""
+        """Bool [N]: the steps at which the game has fewer lives than at the step before."""
         if self.lives is None:
             return np.zeros(len(self.score), bool)
         return np.diff(self.lives, prepend=self.lives[0]) < 0
 
     @property
     def frame_origin(self) -> tuple[float, float, float]:
-        """Screen row at which the frame begins; screen pixels for a frame pixel, down and across."""
+        """The screen row at which the frame begins, and screen pixels per frame pixel, down and across."""
         height, width = self.config.env.frame_shape
         if self.crop_top is None:
             return 0.0, self.screens.shape[0] / height, self.screens.shape[1] / width
@@ -134,18 +133,18 @@ def record(
     max_steps: int | None = None,
     progress: OnStep | None = None,
 ) -> Iterator[Recording]:
-    """Plays whole games, one after another; each is the first one of `evaluate` with its seed and one environment.
+    """Plays whole games, one after another. Each equals the first game of `evaluate` with its seed and `num_envs=1`.
 
     Args:
       stored: the agent.
       episodes: how many games.
-      seed: of the first game, and of what is sampled in it; the next one has the next seed.
+      seed: of the first game and of its sampled actions; the next game has the next seed.
       greedy: whether the likeliest actions are taken.
-      max_steps: cuts a game after so many decisions; None for a whole one.
-      progress: called after each step.
+      max_steps: decisions after which a game is cut; None for a whole game.
+      progress: called after each step with the steps so far and the score.
 
     Raises:
-      ConfigError: if there is no such game.
+      ConfigError: the game cannot be played here.
     """
     config = stored.agent.config
     names = action_names(config) or tuple(f"action {i}" for i in range(stored.agent.num_actions))
@@ -175,7 +174,7 @@ def _play(
     max_steps: int | None,
     progress: OnStep | None,
 ) -> dict[str, Any]:
-    """One game: the fields of a recording that come from playing."""
+    """Plays one game; returns the fields of a recording that come from playing."""
     config, state = stored.agent.config, stored.agent.initial_state(1)
     timestep, outcome = environment.reset()
     screens, total = Screens(), np.zeros((*config.env.frame_shape, *config.env.pixel_shape))
@@ -197,7 +196,7 @@ def _play(
         send(environment, np.asarray(row.output.natural_action), row.output.focal_point)
         timestep, outcome = environment.recv()
         if outcome.is_over[0] and timestep.is_first[0]:
-            break  # the engine tells of the game's end only with the next one's first screen
+            break  # the engine reports the game's end together with the next game's first screen
     about = facts_of(environment)
     return {
         "facts": None if about is None else {name: values[0] for name, values in about.items()},
@@ -219,7 +218,7 @@ def _decide(
     timestep: TimeStep,
     key: PRNGKeyArray,
 ) -> tuple[_Row, Float[Array, "H W *C"], ActorState]:
-    """One decision, with the frame and what the packed sensor gives of it before normalisation."""
+    """Makes one decision; returns it with the frame and what the packed sensor gives of it before normalisation."""
     output, network, state = agent.act(params, statistics, state, timestep, key, greedy=greedy)
     frame = agent.frame(timestep.frame)[0]
     images = sense(frame, output.focal_point[0], sensor=agent.sensor.packed)
@@ -228,12 +227,12 @@ def _decide(
 
 
 def _renders(config: Config) -> bool:
-    """Whether the engine can show its screens in colour; ale-py's vector environment has those of the frames alone."""
+    """Whether the engine can render colour screens; ale-py's vector environment gives only the agent's frames."""
     return config.env.engine != "ale" or not is_atari(config)
 
 
 def _columns(rows: Sequence[_Row]) -> dict[str, Any]:
-    """The fields of a recording that are the decisions' fields, row after row."""
+    """Joins the decisions row by row; returns the fields of a recording that come from them."""
     outputs, networks, images = zip(*rows, strict=True)
     learned = networks[0].vision_logits is not None
 
@@ -258,7 +257,7 @@ def _rgb(screen: np.ndarray) -> np.ndarray:
 
 
 def watch(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
-    """`record`, with a bar for each game while it is played."""
+    """Does what `record` does, with a progress bar for each game."""
 
     def progress(steps: int, score: float) -> None:
         bar.update(task, completed=steps, note=f"{steps:,} steps, score {score:g}")
@@ -271,6 +270,6 @@ def watch(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, 
 
 
 def progress_bar() -> Progress:
-    """Bars with a note at their end."""
+    """Makes progress bars that end with a note."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
     return Progress(*columns)

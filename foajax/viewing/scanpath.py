@@ -1,4 +1,4 @@
-"""A scanpath: a scene with the fixations of one episode, numbered, and what was seen at each."""
+"""Draws a scanpath: a scene with the fixations of one episode, numbered, and what was seen at each."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _ACROSS = 4  # such tiles in a row
 
 
 def fixations(points: Int[np.ndarray, "N 2"]) -> list[tuple[int, int]]:
-    """First decision and number of decisions of each stay of the focal point at one place."""
+    """Returns each fixation, a stay of the focal point at one place: its first decision and how many decisions."""
     moved = np.flatnonzero(np.any(np.diff(points, axis=0) != 0, axis=1)) + 1
     starts = [0, *moved.tolist()]
     return [(first, last - first) for first, last in zip(starts, [*starts[1:], len(points)], strict=True)]
 
 
 def draw_scanpath(recording: Recording) -> Image.Image:
-    """The scene of one episode with its fixations in order and, beside it, what the sensor saw at each.
+    """Draws the scene of one episode with its fixations in order and, beside it, what the sensor saw at each.
 
-    Decisions at one place are one fixation. The target's box is marked where the task tells it. Of a game of several
-    episodes it is the first one.
+    Decisions in a row at one place are one fixation. The target's box is marked if the task tells it. If the game has
+    several episodes, the first one is drawn.
     """
     starts = np.flatnonzero(recording.is_first[1:]) + 1
-    length = int(starts[0]) if len(starts) else len(recording.score)  # rows; nobody decides upon the last one
+    length = int(starts[0]) if len(starts) else len(recording.score)  # rows; the last one's decision has no effect
     points = recording.focal_point[: max(length - 1, 1)]
     stays = fixations(points)
     scene = _scene(recording, recording.screens[length - 1], points, stays)
@@ -66,7 +66,7 @@ def _scene(
     points: Int[np.ndarray, "N 2"],
     stays: Sequence[tuple[int, int]],
 ) -> Image.Image:
-    """The screen enlarged, the path as a line, a number where the gaze rested, the last focal areas outlined."""
+    """Enlarges the screen; draws the path as a line, a number per fixation, and the last focal areas' outlines."""
     scale = fit(screen.shape[:2], (_SIDE, _SIDE))
     image = enlarge(Image.fromarray(screen), scale)
     top, down, across = (scale * part for part in recording.frame_origin)
@@ -88,7 +88,7 @@ def _scene(
 
 
 def _tiles(recording: Recording, points: Int[np.ndarray, "N 2"], stays: Sequence[tuple[int, int]]) -> list[Image.Image]:
-    """What the sensor saw at each fixation, put back in the frame's place and cut to the two finest rings."""
+    """Draws what the sensor saw at each fixation, at its place in the frame, cut to the two finest rings."""
     sensor = make_sensor(recording.config.sensor).packed
     frame_shape = recording.config.env.frame_shape
     painting = tables(sensor, frame_shape)

@@ -1,4 +1,4 @@
-"""One picture of a recorded step: the game with the gaze on it, what is seen, both heads. A video's frame."""
+"""Draws a recorded step as a frame of a video: the game with the gaze on it, what is seen, both heads."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Scene:
         self._row = min(24, _HEADS // (len(self._natural) + len(self._visual)))
 
     def draw(self, step: int) -> Image.Image:
-        """The picture of a step, RGB."""
+        """Returns the picture of a step, RGB."""
         image = self._still.copy()
         self._draw_screen(image, step)
         self._draw_view(image, step)
@@ -57,7 +57,7 @@ class Scene:
         return image
 
     def _background(self) -> Image.Image:
-        """All that does not change."""
+        """Draws all that does not change from step to step."""
         recording = self._recording
         image = Image.new("RGB", _SIZE, PAPER)
         pen = ImageDraw.Draw(image)
@@ -78,7 +78,7 @@ class Scene:
         image.paste(screen, (_MARGIN, _TOP))
 
     def _draw_view(self, image: Image.Image, step: int) -> None:
-        """The values put back in the frame's place, and below them the images as the network gets them."""
+        """Draws the values at their place in the frame, and below them the images as the network gets them."""
         recording = self._recording
         picture = paint(self._values[step], recording.focal_point[step], self._painting)
         view = enlarge(brighten(picture, self._white), fit(picture.shape[:2], (_VIEW, _VIEW)))
@@ -116,7 +116,7 @@ class Scene:
         probs: np.ndarray,
         chosen: int,
     ) -> int:
-        """One head's policy, of `some` actions; the chosen one is bright. Returns where the next head may begin."""
+        """Draws the probabilities of `some` of a head's actions, the chosen one bright; returns the next head's top."""
         pen, height = ImageDraw.Draw(image), self._row
         left, right = _HEADS_LEFT, _SIZE[0] - _MARGIN
         caption = what if len(some) == len(called) else f"{what}, the {len(some)} likeliest of {len(called)}"
@@ -158,7 +158,7 @@ class Scene:
 
 
 def _chart(recording: Recording) -> Image.Image:
-    """Both values over the whole game; points made as ticks, lost lives as lines."""
+    """Draws both heads' values over the whole game, points as ticks and lost lives as lines."""
     width, height = _CHART
     image = Image.new("RGB", _CHART, PANEL)
     pen = ImageDraw.Draw(image)
@@ -179,10 +179,10 @@ def _chart(recording: Recording) -> Image.Image:
 
 
 def _likeliest(probs: np.ndarray, most: int) -> np.ndarray:
-    """At most so many actions of the policies [N, n]: the likeliest over the game, in their own order."""
+    """Returns the `most` actions that are likeliest over the game, in their own order; `probs` is [N, n]."""
     return np.sort(np.argsort(-probs.mean(axis=0), kind="stable")[:most])
 
 
 def _dim(colour: str) -> str:
-    """The same hue, darker."""
+    """Darkens a colour."""
     return "#" + "".join(f"{int(colour[i : i + 2], 16) * 55 // 100:02x}" for i in (1, 3, 5))

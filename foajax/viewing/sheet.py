@@ -1,4 +1,4 @@
-"""What sensors see of one frame, drawn side by side; the brightest pixel of the frame is drawn white."""
+"""Draws what sensors see of one frame, side by side; the brightest pixel of the frame is drawn white."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Panel = tuple[str, Image.Image]  # caption and picture
 
 
 def draw(frame: np.ndarray, sensor: Sensor, points: Sequence[tuple[int, int]], *, name: str) -> Image.Image:
-    """One sensor on one frame: a heading and a row for each focal point.
+    """Draws one sensor on one frame: a heading and a row for each focal point.
 
     Args:
       frame: float32 [H, W] or [H, W, 3] in [0, 1].
@@ -50,7 +50,7 @@ def draw(frame: np.ndarray, sensor: Sensor, points: Sequence[tuple[int, int]], *
 
 
 def contact_sheet(frame: np.ndarray, sensors: dict[str, Sensor], points: Sequence[tuple[int, int]]) -> Image.Image:
-    """Several sensors on one frame, two abreast; each with a pair of panels for every focal point."""
+    """Draws several sensors on one frame, two in a row, each with a pair of panels for every focal point."""
     blocks = [
         _headed(
             _join([_row(_panels(frame, sensor, point)[:2]) for point in points], _DOWN),
@@ -62,7 +62,7 @@ def contact_sheet(frame: np.ndarray, sensors: dict[str, Sensor], points: Sequenc
 
 
 def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[Panel]:
-    """The frame, what is seen of it, and the packed images."""
+    """Draws the frame, what is seen of it, and the packed images."""
     images, seen = _look(jnp.asarray(frame), jnp.asarray(point, jnp.int32), sensor)
     white = float(frame.max()) or 1.0
     panels = [
@@ -81,14 +81,14 @@ def _panels(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> list[P
 def _look(
     frame: Float[Array, "H W *C"], focal_point: Int[Array, "2"], sensor: Sensor
 ) -> tuple[tuple[Float[Array, "_ _ _"], ...], Float[Array, "H W _"]]:
-    """What the sensor gives, and that put back in its place."""
+    """Returns what the sensor gives, and the same at its place in a frame."""
     images = sense(frame, focal_point, sensor=sensor)
     shape = (frame.shape[0], frame.shape[1])
     return images, picture(images, focal_point, sensor=sensor, frame_shape=shape)
 
 
 def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.Image:
-    """The frame with the focal areas and the focal point drawn on it."""
+    """Draws the frame with the focal areas and the focal point on it."""
     image = _image(frame)
     scale = image.width // frame.shape[1]
     draw_gaze(image, sensor, point, scale=(scale, scale))
@@ -96,7 +96,7 @@ def _marked(frame: np.ndarray, sensor: Sensor, point: tuple[int, int]) -> Image.
 
 
 def _image(values: np.ndarray) -> Image.Image:
-    """Values [h, w], [h, w, 1] or [h, w, 3] in [0, 1] as an image, each a square of pixels."""
+    """Draws values [h, w], [h, w, 1] or [h, w, 3] in [0, 1], each as a square of pixels."""
     height, width = values.shape[:2]
     scale = max(1, _SIDE // max(height, width))
     levels = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8).reshape(height, width, -1)
@@ -105,27 +105,27 @@ def _image(values: np.ndarray) -> Image.Image:
 
 
 def _row(panels: Sequence[Panel]) -> Image.Image:
-    """Panels side by side, each under its caption."""
+    """Puts panels side by side, each under its caption."""
     blocks = []
     for caption, image in panels:
         width = max(image.width + 2, round(font(12).getlength(caption)))
         block = Image.new("RGB", (width, image.height + 2 + _LINE), _PAPER)
         ImageDraw.Draw(block).text((0, 0), caption, fill=_FAINT, font=font(12))
-        # White pixels are to end somewhere on a white page.
+        # The border shows where white pixels end on a white page.
         block.paste(ImageOps.expand(image, 1, _FAINT), (0, _LINE))
         blocks.append(block)
     return _join(blocks, _ACROSS)
 
 
 def _heading(frame: np.ndarray, sensor: Sensor, name: str) -> tuple[str, str]:
-    """The sensor's name, and its pixel budget as Table II counts it."""
+    """Returns the sensor's name and its pixel budget, counted as in Table II."""
     count = sensor.count((frame.shape[0], frame.shape[1]))
     shown = "" if count.actual == count.nominal else f" ({count.actual:,} shown)"
     return name, f"{count.nominal:,} values{shown}, {100 * count.nominal / np.prod(frame.shape[:2]):.0f}% of the frame"
 
 
 def _headed(image: Image.Image, title: str, note: str) -> Image.Image:
-    """An image under a heading."""
+    """Puts a heading above an image."""
     large, small = font(16), font(12)
     start = round(large.getlength(title)) + _GAP
     width = max(image.width, start + round(small.getlength(note)))
@@ -138,7 +138,7 @@ def _headed(image: Image.Image, title: str, note: str) -> Image.Image:
 
 
 def _join(images: Sequence[Image.Image], axis: int) -> Image.Image:
-    """Images from left to right with their tops aligned, or from top to bottom."""
+    """Joins images from left to right with their tops aligned, or from top to bottom."""
     size = [max(sides) for sides in zip(*(image.size for image in images), strict=True)]
     size[axis] = sum(image.size[axis] for image in images) + _GAP * (len(images) - 1)
     joined, place = Image.new("RGB", (size[0], size[1]), _PAPER), [0, 0]
@@ -149,7 +149,7 @@ def _join(images: Sequence[Image.Image], axis: int) -> Image.Image:
 
 
 def save(image: Image.Image, out: str) -> None:
-    """Writes a PNG with a margin; 64 colours are enough for grey levels, rings and text."""
+    """Writes a PNG with a margin, of 64 colours to keep it small."""
     page = Image.new("RGB", (image.width + 2 * _GAP, image.height + 2 * _GAP), _PAPER)
     page.paste(image, (_GAP, _GAP))
     try:

@@ -1,4 +1,4 @@
-"""What pictures of the gaze share: colours, fonts, scales, and the outlines of the focal areas."""
+"""Defines what pictures of the gaze share: colours, fonts, scales, and the outlines of the focal areas."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from foajax.sensors.base import Sensor, boxes
 
-RINGS = ("#ffb000", "#2fb8ff", "#ff5c9a")  # inner to outer, told apart by the colour-blind too
+RINGS = ("#ffb000", "#2fb8ff", "#ff5c9a")  # inner to outer; the colour-blind can tell them apart
 NATURAL, VISION = "#58d68d", "#b794ff"  # the two heads
 HALO = "#000000"  # under a line that has to show on any screen
 PAPER, PANEL, INK, FAINT = "#12161b", "#1b2128", "#e8edf2", "#8b98a5"  # of dark pictures
@@ -48,9 +48,9 @@ def draw_gaze(
       image: changed in place.
       sensor: whose areas.
       point: (y, x) in frame pixels.
-      scale: pixels of the image for one of the frame, (down, across).
+      scale: image pixels per frame pixel, (down, across).
       top: row of the image at which the frame begins.
-      halo: whether lines get a dark rim.
+      halo: whether lines have a dark rim.
     """
     pen = ImageDraw.Draw(image)
     down, across = scale
@@ -69,22 +69,22 @@ def draw_gaze(
 
 @functools.cache
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own, at a size in pixels."""
+    """Returns Pillow's own font at a size in pixels."""
     return ImageFont.load_default(size)
 
 
 def fit(shape: tuple[int, ...], room: tuple[int, int]) -> float:
-    """The scale at which a picture fits: a whole number, unless it has to shrink."""
+    """Returns the scale at which a picture fits: a whole number, unless it has to shrink."""
     scale = min(limit / size for limit, size in zip(room, shape, strict=True))
     return float(int(scale)) if scale >= 1 else scale
 
 
 def enlarge(image: Image.Image, scale: float) -> Image.Image:
-    """An image at a scale: enlarged in squares, shrunk to means."""
+    """Scales an image: pixels become squares, or are averaged if it shrinks."""
     how = Image.Resampling.NEAREST if scale >= 1 else Image.Resampling.BOX
     return image.resize((round(scale * image.width), round(scale * image.height)), how)
 
 
 def brighten(values: UInt8[np.ndarray, "h w *C"], white: int) -> Image.Image:
-    """Values [h, w] or [h, w, 3] as an RGB image in which `white` is drawn white."""
+    """Draws values [h, w] or [h, w, 3] as an RGB image, with the value `white` as white."""
     return Image.fromarray((values.astype(np.uint16) * 255 // white).astype(np.uint8)).convert("RGB")

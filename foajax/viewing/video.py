@@ -1,4 +1,4 @@
-"""A recorded game as a video."""
+"""Writes a recorded game as a video."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from foajax.envs.make import steps_per_second
 from foajax.viewing.recording import Recording
 from foajax.viewing.scene import Scene
 
-_GIF_STEPS = 1000  # written at most: each takes 1.2 MB of memory
+_GIF_STEPS = 1000  # at most, as each takes 1.2 MB of memory
 
 
 def write_video(recording: Recording, file: Path, bar: Progress) -> None:
-    """An mp4, or the first minute or so as a GIF, by the name of the file."""
+    """Writes an mp4 or, if the file's name ends in .gif, the first 1,000 steps as a GIF."""
     scene, steps, write = Scene(recording), len(recording.screens), _write_mp4
     if file.suffix == ".gif":
         write = _write_gif
         if steps > _GIF_STEPS:
-            remedy = "whole games are for format=mp4 (pip install -e '.[video]')"
-            bar.console.print(f"{file}: the first {_GIF_STEPS:,} of {steps:,} steps; {remedy}", markup=False)
+            remedy = "for whole games, pip install 'foajax[video]' and use format=mp4"
+            bar.console.print(f"{file}: only the first {_GIF_STEPS:,} of {steps:,} steps; {remedy}", markup=False)
         steps = min(steps, _GIF_STEPS)
     task = bar.add_task(file.name, total=steps, note="")
     frames = (scene.draw(i) for i in range(steps))
@@ -37,26 +37,26 @@ def write_video(recording: Recording, file: Path, bar: Progress) -> None:
 
 
 def _write_mp4(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
-    """Through a pipe to the ffmpeg of imageio-ffmpeg, whose own writer forks, which JAX's threads do not bear."""
+    """Pipes frames to the ffmpeg of imageio-ffmpeg. Its own writer forks, which JAX's threads do not survive."""
     from imageio_ffmpeg import get_ffmpeg_exe  # an extra
 
     first = next(frames)
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.width}x{first.height}", "-r", f"{rate}", "-i", "-"]
     codec = ["-c:v", "libx264", "-preset", "veryfast", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *codec, str(file)]
-    # A pipe that breaks is an ffmpeg that has ended, and its exit code tells.
+    # If the pipe breaks, ffmpeg has ended, and its exit code says why.
     with contextlib.suppress(BrokenPipeError), subprocess.Popen(command, stdin=subprocess.PIPE) as process:
         assert process.stdin is not None
         for frame in itertools.chain([first], frames):
             process.stdin.write(frame.tobytes())
     if process.returncode:
-        raise refuse("out", file.parent, "a directory that a video can be written to")
+        raise refuse("out", file.parent, "a directory that can be written", why=f"ffmpeg could not write {file.name}")
 
 
 def _write_gif(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
-    """All pictures are in memory, twice, because Pillow writes none before it has the last one.
+    """Holds all pictures in memory, twice, as Pillow writes none before it has the last one.
 
-    A GIF's times are whole hundredths of a second: rounded so that they add up.
+    A GIF's times are whole hundredths of a second, rounded so that they add up.
     """
     small = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
     ends = np.round(np.arange(1, len(small) + 1) * 100 / rate)
@@ -66,14 +66,13 @@ def _write_gif(frames: Iterator[Image.Image], file: Path, rate: float) -> None:
 
 @functools.cache
 def why_no_mp4() -> str | None:
-    """What is missing before an mp4 can be written; None where nothing is."""
-    install = "pip install imageio-ffmpeg"
+    """Says what is missing to write an mp4; None if nothing is."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        return f"imageio-ffmpeg is missing ({install})"
+        return "imageio-ffmpeg is missing (pip install 'foajax[video]')"
     from imageio_ffmpeg import get_ffmpeg_exe
 
     try:
         subprocess.run([get_ffmpeg_exe(), "-version"], check=True, capture_output=True)
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        return f"the ffmpeg of imageio-ffmpeg does not run ({one_line(error)}; {install}, or IMAGEIO_FFMPEG_EXE=<path>)"
+        return f"the ffmpeg of imageio-ffmpeg does not run ({one_line(error)}); IMAGEIO_FFMPEG_EXE=<path> names another"
     return None

@@ -403,8 +403,8 @@ def test_without_a_launcher_each_run_is_a_command_of_its_own(cwd, runs, monkeypa
     [
         (["-m", "--jobs=0"], "--jobs=0: accepted is --jobs=N"),
         (["-m", "--jobs", "4"], "--jobs: accepted is --jobs=N"),
-        (["--jobs=2"], "--jobs=2: accepted is the same with --multirun"),
-        ([*HERE, "--jobs=2"], "--jobs=2: accepted is the same with --multirun"),
+        (["--jobs=2"], "--jobs=2: accepted is --jobs=2 --multirun, without"),
+        ([*HERE, "--jobs=2"], "--jobs=2: accepted is --jobs=2 --multirun, without"),
     ],
 )
 def test_jobs_is_a_number_and_for_local_sweeps(cwd, runs, capsys, arguments, said):
@@ -478,8 +478,9 @@ def test_a_run_of_ones_own_is_started_swept_and_shown(cwd, own, runs, capsys, mo
     assert run(runs.record, [words[0], "--help"]) == 0 and "gaze: fast, frozen" in capsys.readouterr().out
     monkeypatch.setattr(sweep, "run_all", lambda runs, *, jobs, command: int(command[-1] != words[0]))
     assert run(runs.record, [*words, "-m", "seed=1,2"]) == 0
-    assert run(runs.record, ["--config-dir=nowhere"]) == 2
-    assert "--config-dir=nowhere: accepted is a directory with experiment/" in capsys.readouterr().err
+    for words in (["--config-dir=nowhere"], ["--config-dir", "nowhere"]):
+        assert run(runs.record, words) == 2
+        assert "--config-dir=nowhere: accepted is a directory with experiment/" in capsys.readouterr().err
 
 
 def test_words_of_before_are_understood_and_answered_with_todays(cwd, runs, capsys):

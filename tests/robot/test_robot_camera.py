@@ -185,10 +185,10 @@ def test_images_are_gray_or_another_size_from_one_to_the_next(agent):
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--source", "nothing.avi"], "source=nothing.avi: accepted is a camera's number"),
+        (["--source", "nothing.avi"], "source=nothing.avi: cannot be opened; accepted is a camera's number"),
         (["--drive", "nothing:go"], "drive=nothing:go: accepted is module:function"),
         (["--drive", ""], "end: 2 frames"),
-        (["--draw", "/nowhere/seen.mp4"], "draw=/nowhere/seen.mp4: accepted is a file to write"),
+        (["--draw", "/nowhere/seen.mp4"], "draw=/nowhere/seen.mp4: cannot be written; accepted is a .mp4"),
         (["--folder", "/nowhere"], "/nowhere: accepted is a folder that foajax export wrote"),
     ],
 )

@@ -84,14 +84,14 @@ def test_the_file_says_what_it_is(make_stored):
 def test_a_part_that_nobody_knows_is_refused(make_stored):
     stored = make_stored("experiment=constant70_packed")
     params = {"params": stored.params["params"] | {"attention": {"kernel": np.zeros((2, 2), np.float32)}}}
-    with pytest.raises(ConfigError, match="network: has attention/kernel too; accepted is"):
+    with pytest.raises(ConfigError, match="parameters: the network has no attention/kernel; accepted is those of"):
         onnx_graph.policy(stored.agent, params, {})
 
 
 def test_a_part_that_is_missing_is_refused(make_stored):
     stored = make_stored("experiment=constant70_packed")
     params = {"params": {name: part for name, part in stored.params["params"].items() if name != "dense"}}
-    with pytest.raises(ConfigError, match="network: has no dense/kernel"):
+    with pytest.raises(ConfigError, match="parameters: dense/kernel is missing; accepted is those of"):
         onnx_graph.policy(stored.agent, params, {})
 
 

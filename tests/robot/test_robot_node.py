@@ -158,7 +158,7 @@ def test_compressed_images(make):
     for data in (b"", b"no image"):
         node.tick(1.0)
         listen(Message(format="jpeg", data=data))
-    assert node.logger.errors == ["format=jpeg: accepted is an image that OpenCV decodes"] * 2
+    assert node.logger.errors == ["format=jpeg: cannot be decoded; accepted is a whole JPEG or PNG image"] * 2
     assert node.agent.age == 1
 
 
@@ -195,7 +195,7 @@ def test_a_decision_that_takes_too_long_is_told(make, monkeypatch):
     node = make()
     monkeypatch.setattr(node.agent, "decide", lambda frame, reward: node.tick(0.1) or (0, 0))
     node.heard["image_raw"][1](raw(IMAGE, "rgb8"))
-    assert node.logger.warnings == ["a decision took 100.0 ms, its period is 66.7 ms"]
+    assert node.logger.warnings == ["a decision took 100.0 ms, longer than its period of 66.7 ms"]
 
 
 @pytest.mark.parametrize(

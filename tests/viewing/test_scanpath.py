@@ -73,7 +73,7 @@ def test_demo_and_render_draw_it(searcher, tmp_path, capsys):
     save_agent(searcher, tmp_path / "agent")
     assert cli.run(demo.demo, [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'demo'}"]) == 0
     said = capsys.readouterr().out
-    assert re.search(r"Of 6 scenes it answered \d right", said) and "demo/scanpath.png" in said
+    assert re.search(r"It answered \d of 6 scenes right", said) and "demo/scanpath.png" in said
     assert cli.run(render.render, [f"run={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", "video=false"]) == 0
     assert "scanpath-0.png" in capsys.readouterr().out
     for file in (tmp_path / "demo" / "scanpath.png", tmp_path / "out" / "scanpath-0.png"):
