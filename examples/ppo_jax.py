@@ -102,7 +102,7 @@ def update(params, state, batch, optimizer):
 
 
 def train(game="pong", sensor="constant70_packed", steps=1_000_000, num_envs=8, seed=0, report=print):
-    """Trains; returns the parameters and the returns of all episodes."""
+    """Trains; returns the parameters and all episodes' returns."""
     env = foajax.FoveatedVectorObservation(
         AtariVectorEnv(game, num_envs, stack_num=4), sensor, dtype=np.uint8, actions="multidiscrete"
     )

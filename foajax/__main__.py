@@ -1,4 +1,4 @@
-"""`foajax <command> [words]`, the same as `python -m foajax.<command> [words]`."""
+"""Runs `foajax <command> [words]`, the same as `python -m foajax.<command> [words]`."""
 
 from __future__ import annotations
 

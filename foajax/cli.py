@@ -1,4 +1,4 @@
-"""Command lines of the form `key=value`, checked against a section of keys."""
+"""Reads command lines of `key=value` words and checks them against a section of keys."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def test_a_look_sees_this_process(tmp_path):
 @pytest.mark.parametrize("times", [[], [300.0], [0.0, 10.0, 1790.0, 1800.0], [0.0, 300.0, 310.0, 1200.0]])
 def test_too_few_rows_for_a_speed_are_named(times):
     samples = [soak.Sample(float(second), 10**9, 20, 30) for second in range(1800)]
-    with pytest.raises(ConfigError, match=rf"^minutes=30: accepted is .*in all there are {len(times)}\)$"):
+    with pytest.raises(ConfigError, match=rf"^minutes=30: accepted is .*there are {len(times)} rows in all\)$"):
         soak.verdict(samples, [{"time": time, "env_steps": int(1000 * time)} for time in times], 1800.0)
 
 

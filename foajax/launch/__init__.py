@@ -1,1 +1,1 @@
-"""How runs are started: one, a sweep, or one run in several processes."""
+"""Starts runs: one, a sweep, or one run in several processes."""

@@ -139,7 +139,7 @@ def _help(directory: Path | None) -> str:
 def _jobs(word: str = "--jobs=1", *more: str) -> int:
     number = word.partition("=")[2]
     if more or not number.isdecimal() or int(number) < 1:
-        raise refuse(one_line(word, *more), accepted="one --jobs=N, the number of runs at a time, an integer >= 1")
+        raise refuse(one_line(word, *more), accepted="--jobs=N, given once: N >= 1 runs at a time")
     return int(number)
 
 

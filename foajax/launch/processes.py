@@ -199,7 +199,7 @@ def _local_devices(config: Config) -> list[jax.Device]:
 
 
 def _gather(leaves: list[np.ndarray]) -> list[np.ndarray]:
-    """Concatenates over processes. All arrays go in one exchange, as its delay costs more than its size."""
+    """Concatenates over processes. All arrays go in one exchange, whose delay costs more than its size."""
     blob = np.frombuffer(b"".join(leaf.tobytes() for leaf in leaves), np.uint8)
     parts = []
     for row in multihost_utils.process_allgather(blob):

@@ -107,7 +107,7 @@ def training_score(runs: Sequence[RunData], *, share: float) -> Interval:
 
 
 def above_chance(score: Interval, game: str) -> Interval:
-    """Subtracts the score of random play, 0 in a game without a reference."""
+    """Subtracts the score of random play, which is taken as 0 in a game without a reference."""
     chance = REFERENCE.get(game, (0.0, 0.0))[0]
     return Interval(*(each - chance for each in score))
 
@@ -120,10 +120,9 @@ def over(a: Interval, b: Interval) -> Interval:
 
 
 def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) -> Interval | None:
-    """Divides where `slow` first reaches a score, along the axis, by where `fast` does: the lower of their last scores.
+    """Compares how far along the axis `slow` and `fast` first reach the lower of their last scores: slow / fast.
 
-    Curves are means over seeds, and the interval is by bootstrap over both groups. None if the curves of a group do not
-    overlap.
+    Curves are means over seeds; the interval is by bootstrap over both. None if the curves of a group do not overlap.
     """
     first, second = on_common_axis(slow, axis), on_common_axis(fast, axis)
     if first is None or second is None:

@@ -42,7 +42,8 @@ def keep(path: Path, name: str | None) -> Path:
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"foajax evaluate run={path} episodes={episodes} json={path}/score.json"
-        raise refuse("run", path, f"{wanted}, as {command} writes it", why=f"its score.json has {found}")
+        why = f"its score.json has {found}, not {wanted}" if run.evaluation else "has no score.json"
+        raise refuse("run", path, f"what {command} writes", why=why)
     heat = heatmap.of_run(path, newest)
     if heat is None and watched:
         command = f"foajax render run={path} episodes=10 video=false"

@@ -35,7 +35,7 @@ class AgentError(Exception):
 
 
 class Agent:
-    """One agent looking through one camera.
+    """An exported agent that looks through one camera or at one game's screen.
 
     Args:
       folder: what `foajax export` wrote.
@@ -266,22 +266,21 @@ def read_facts(folder: Path) -> dict[str, Any]:
         for name in ("policy.onnx", "arrays.npz"):
             if hashlib.sha256((folder / name).read_bytes()).hexdigest() != facts["files"][name]:
                 raise AgentError(f"{folder / name}: is not the file that was exported; export again")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        why = f"{type(error).__name__}: {error}"
-        raise AgentError(f"{folder}: accepted is a folder that foajax export wrote ({why})") from None
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise AgentError(f"{folder}: accepted is a folder that foajax export wrote ({type(e).__name__}: {e})") from None
     return facts
 
 
 @functools.cache
 def _spans(source: int, target: int, begin: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """The source pixel in which each target pixel begin .. end begins; which begin inside one, the part before them."""
+    """Returns the source pixel in which each target pixel begins; which ones begin inside it; how far; the scale."""
     first, rest = np.divmod(np.arange(begin, end + 1) * source, target)
     shared = np.flatnonzero(rest)
     return first, shared, (rest[shared] / target).astype(np.float32)[:, None], target / source
 
 
 def _share(sums: np.ndarray, pixels: np.ndarray, shared: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Moves the part of each shared pixel to the sum before; the spare last sum takes that before the first one."""
+    """Moves `part` of each shared pixel from its sum to the one before; the spare last sum absorbs the first's."""
     moved = part * pixels
     sums[shared] -= moved
     sums[shared - 1] += moved

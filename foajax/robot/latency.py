@@ -94,7 +94,7 @@ def _measure(configs: Sequence[Config], dtype: str, repeats: int) -> list[dict[s
 
 
 def energy(flops: int, weight_bytes: int, image_bytes: int) -> float:
-    """Estimates joules: of every operation, and of every byte of weights and image, read from memory once."""
+    """Estimates joules: every operation counts, and every byte of weights and image, read from memory once."""
     return flops * _JOULES_PER_FLOP + (weight_bytes + image_bytes) * _JOULES_PER_BYTE
 
 

@@ -31,7 +31,7 @@ _ZOOM = 0.25  # gaze that can reach less than this share of the frame is shown e
 
 @dataclasses.dataclass(frozen=True)
 class HeatMap:
-    """How often the gaze was where."""
+    """How often the focal point was at each place of the frame."""
 
     counts: Int[np.ndarray, "H W"]  # steps with the focal point at (y, x)
     mean_frame: Float[np.ndarray, "H W *C"]  # over the same steps, 0 to 1

@@ -257,7 +257,7 @@ def _rgb(screen: np.ndarray) -> np.ndarray:
 
 
 def watch(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, **how: Any) -> Iterator[Recording]:
-    """Does what `record` does, with a progress bar for each game."""
+    """Plays games like `record`, with a progress bar for each."""
 
     def progress(steps: int, score: float) -> None:
         bar.update(task, completed=steps, note=f"{steps:,} steps, score {score:g}")

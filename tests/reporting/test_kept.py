@@ -113,5 +113,8 @@ def test_a_run_that_is_not_finished_is_refused(run):
 def test_a_score_of_fewer_games_is_refused(run):
     score = json.loads((run / "score.json").read_text())
     (run / "score.json").write_text(json.dumps(score | {"episodes": 30}))
-    with pytest.raises(ConfigError, match="score.json has .*30.*accepted is .*100"):
+    with pytest.raises(ConfigError, match="score.json has .*30.*accepted is what foajax evaluate .*episodes=100"):
+        kept.keep(run, None)
+    (run / "score.json").unlink()
+    with pytest.raises(ConfigError, match="has no score.json; accepted is what foajax evaluate"):
         kept.keep(run, None)
