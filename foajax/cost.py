@@ -53,11 +53,11 @@ class Options(Section):
     def names(self) -> list[str]:
         if self.experiments is not None:
             return self.experiments.split(",")
-        return [name for name in list_experiments() if self.target == "jax" or is_exportable(name)]
+        return [name for name in list_experiments() if self.target == "jax" or has_atari_frames(name)]
 
 
-def is_exportable(experiment: str) -> bool:
-    """Whether `target=onnx` can time an experiment: whether its frames are Atari's."""
+def has_atari_frames(experiment: str) -> bool:
+    """Whether an experiment looks at frames of Atari's size, which `target=onnx` can time."""
     return compose([f"experiment={experiment}"]).env.frame_shape == (80, 80)
 
 

@@ -136,7 +136,7 @@ def test_a_mistake_is_one_line(word, message, capsys):
     assert error.count("\n") == 1
 
 
-def test_all_experiments_that_can_be_exported_are_timed():
+def test_without_names_all_experiments_on_frames_of_80x80_are_timed_as_exported():
     timed = command.Options(target="onnx").names
     assert "nonfoa" in timed and "search_full" not in timed
     assert set(timed) < set(command.Options().names)

@@ -76,7 +76,7 @@ def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = COMMAND)
     """
     waiting = deque(run for run in runs if not skip_if_finished(run.config))
     failures: dict[str, str] = {}
-    shares = deque(shares_of_cores(min(jobs, len(waiting) or 1)))  # few runs leave no core idle
+    shares = deque(shares_of_cores(min(jobs, len(waiting) or 1)))  # so that few runs leave no core idle
     taken: dict[str, set[int]] = {}  # by run directory
     stop = _Stop()
     with stop.listening():

@@ -29,7 +29,7 @@ class Games(NamedTuple):
 
 
 def environment(stored: TrainedAgent, *, num_envs: int, seed: int, render: bool = False) -> Environment:
-    """Makes the game that an agent was trained in, with seeds that training does not use.
+    """Makes the game that an agent was trained in, with seeds apart from those of training.
 
     Visual search has no staircase here: scenes are as hard as `search` says from the first one on.
 
