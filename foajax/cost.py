@@ -116,7 +116,7 @@ def _print(records: Sequence[dict[str, Any]]) -> None:
 def _print_exported(records: Sequence[dict[str, Any]]) -> None:
     table = Table(box=box.SIMPLE, title=f"ONNX Runtime, {records[0]['dtype']}; us, median | 99%")
     headings = ("frame", "sense", "torso", "network", "screen", "camera", "JAX, screen")
-    for heading in ("experiment", *headings, "ratio", "MB", "memory MB", "start s", "energy est. uJ"):
+    for heading in ("experiment", *headings, "ratio", "file\nMB", "memory\nMB", "start\ns", "energy est.\nuJ"):
         table.add_column(heading, no_wrap=True, justify="left" if heading == "experiment" else "right")
     for record in records:
         parts = ("frame", "sense", "torso", "network", "screen", "camera", "jax_screen")
