@@ -39,7 +39,7 @@ def camera(task: str = "InvertedPendulum-v5", size: int = 84, levels: int = 3, *
 
 
 def driving(skip: int = 4, **kwargs) -> gymnasium.Env:
-    """CarRacing with its five actions, each held for `skip` frames; `pip install "gymnasium[box2d]"`.
+    """Makes CarRacing with its five actions, each held for `skip` frames; `pip install "gymnasium[box2d]"`.
 
     Each frame costs 0.1 and a piece of track earns about 3: the signs of rewards would hide what driving is worth.
     """

@@ -175,7 +175,6 @@ class Sensor:
         return [self._canvas(images, top, left)] if sensor["layout"] == "canvas" else images
 
     def _cut(self, image: np.ndarray, top: int, left: int) -> np.ndarray:
-        """Cuts out the focal area whose top-left pixel is (top, left)."""
         y, x = max(top, 0), max(left, 0)
         part = image[y : top + self._window[0], x : left + self._window[1]]
         area = np.zeros(self._window, np.float32)
