@@ -73,7 +73,7 @@ def reproduce(arguments: Sequence[str]) -> int:
     return failed
 
 
-def _play(runs: Sequence[sweep.Run], jobs: int) -> int:
+def _play(runs: Sequence[sweep.PlannedRun], jobs: int) -> int:
     """Plays finished runs for their scores, and learned gazes for heat maps too; returns 1 if that failed, else 0."""
     commands = []
     for run in runs:
@@ -88,11 +88,11 @@ def _play(runs: Sequence[sweep.Run], jobs: int) -> int:
         return max([int(code != 0) for code in codes], default=0)
 
 
-def _score(run: sweep.Run) -> Path:
+def _score(run: sweep.PlannedRun) -> Path:
     return Path(run.config.run_dir) / "score.json"
 
 
-def _show(planned: Sequence[tuple[str, Sequence[sweep.Run]]]) -> int:
+def _show(planned: Sequence[tuple[str, Sequence[sweep.PlannedRun]]]) -> int:
     table = Table("stage", "run", "state", "env_steps", "score")
     for about, runs in planned:
         for run in runs:

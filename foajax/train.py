@@ -25,15 +25,15 @@ def train(config: Config) -> int:
     try:
         start(config)
     except EnvironmentFault as fault:
-        return processes.leave(report_fault(config, str(fault), fault))
+        return processes.end_process(report_fault(config, str(fault), fault))
     except Exception as error:
         if not jax.distributed.is_initialized():
             raise
         if isinstance(error, ConfigError):
             print(f"foajax: error: {error}", file=sys.stderr, flush=True)
-            return processes.leave(2)
+            return processes.end_process(2)
         traceback.print_exc()
-        return processes.leave(1)
+        return processes.end_process(1)
     return 0
 
 

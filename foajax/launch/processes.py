@@ -70,13 +70,13 @@ class Job:
             return tree
         return _by_data(_gather, tree)
 
-    def share(self, tree: Any) -> Any:
+    def broadcast(self, tree: Any) -> Any:
         """Returns process 0's arrays in every process; the others' arrays give the shapes."""
         if self.count == 1:
             return tree
         return _by_data(multihost_utils.broadcast_one_to_all, tree)
 
-    def mine(self, tree: Any) -> Any:
+    def local_part(self, tree: Any) -> Any:
         """Returns this process's part of the leading axis: the inverse of `gather`."""
         if self.count == 1:
             return tree
@@ -87,7 +87,7 @@ class Job:
 
         return jax.tree.map(part, tree)
 
-    def tell(self, name: str, text: str) -> str:
+    def broadcast_text(self, name: str, text: str) -> str:
         """Returns process 0's `text` in every process. A `name` can be used once."""
         if self.count == 1:
             return text
@@ -101,7 +101,7 @@ class Job:
         if self.count == 1:
             return
         settings = {key: value for key, value in flatten(to_mapping(config)) if not key.startswith(_OWN)}
-        first = json.loads(self.tell("configuration", json.dumps(settings)))
+        first = json.loads(self.broadcast_text("configuration", json.dumps(settings)))
         differ = [key for key in {**settings, **first} if settings.get(key) != first.get(key)]
         others = np.flatnonzero(self.gather(np.array([bool(differ)])))
         if differ:
@@ -110,7 +110,7 @@ class Job:
         if others.size:
             raise refuse(f"process {others[0]}", accepted="that of process 0", why="has another configuration")
 
-    def by_first(self, name: str, task: Callable[[], T]) -> T | None:
+    def run_on_first(self, name: str, task: Callable[[], T]) -> T | None:
         """Runs `task` in process 0 and returns its result there, else None; raises its `ConfigError` everywhere."""
         result, problem = None, ""
         if self.is_first:
@@ -118,7 +118,7 @@ class Job:
                 result = task()
             except ConfigError as error:
                 problem = str(error)
-        if problem := self.tell(f"problem: {name}", problem):
+        if problem := self.broadcast_text(f"problem: {name}", problem):
             raise ConfigError(problem)
         return result
 
@@ -219,7 +219,7 @@ def _by_data(function: Callable[[Any], Any], tree: Any) -> Any:
     return jax.tree.unflatten(structure, wrapped)
 
 
-def leave(code: int) -> int:
+def end_process(code: int) -> int:
     """Returns the exit code; with other processes, ends this one here, as an orderly end would wait for them."""
     if jax.process_count() > 1:
         sys.stdout.flush()
@@ -228,7 +228,7 @@ def leave(code: int) -> int:
     return code
 
 
-class Watch:
+class PeerWatch:
     """Ends this process if it waits for others in vain.
 
     Args:

@@ -32,7 +32,7 @@ _POLL = 0.1  # seconds between two looks at the running processes
 _OUTPUT = "output.txt"  # of a run beside others, in its directory
 
 
-class Run(NamedTuple):
+class PlannedRun(NamedTuple):
     """One run of a sweep."""
 
     words: tuple[str, ...]  # its command line
@@ -68,7 +68,7 @@ class _Stop:
                 process.send_signal(number)
 
 
-def run_all(runs: Sequence[Run], *, jobs: int, command: Sequence[str] = COMMAND) -> int:
+def run_all(runs: Sequence[PlannedRun], *, jobs: int, command: Sequence[str] = COMMAND) -> int:
     """Runs `command` with each run's words, `jobs` at a time; returns 1 if one failed, else 0.
 
     With `jobs=1` a run has the terminal and all cores. Else it writes to `output.txt` in its directory and has its
@@ -157,7 +157,7 @@ def _on(cores: set[int]) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def _start(run: Run, command: Sequence[str], *, alone: bool) -> subprocess.Popen:
+def _start(run: PlannedRun, command: Sequence[str], *, alone: bool) -> subprocess.Popen:
     # In a process group of its own, so that the terminal's Ctrl-C reaches it only through us.
     forget_failure(Path(run.config.run_dir))
     words = [*command, *run.words]
@@ -175,10 +175,10 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def expand(words: Sequence[str], config_dir: Path | None = None) -> list[Run]:
+def expand(words: Sequence[str], config_dir: Path | None = None) -> list[PlannedRun]:
     """Composes and checks every run of a sweep, so that a mistake in the last one does not show hours later."""
     swept = swept_by(words)
-    runs: dict[str, Run] = {}
+    runs: dict[str, PlannedRun] = {}
     for overrides in itertools.product(*(_values(word, config_dir) for word in words)):
         plain = compose(overrides, config_dir)
         config = named(plain, overrides, swept)
@@ -186,7 +186,7 @@ def expand(words: Sequence[str], config_dir: Path | None = None) -> list[Run]:
             accepted = "a directory for each, as with 'name=constant70-${gaze.mode}'"
             raise refuse("run", config.run_dir, accepted, why="two runs would share it")
         name = [] if config == plain else [f"name='{config.name}'"]
-        runs[config.run_dir] = Run((*overrides, *name), config)
+        runs[config.run_dir] = PlannedRun((*overrides, *name), config)
     return list(runs.values())
 
 

@@ -14,7 +14,7 @@ from foajax.config.parse import ConfigError, refuse
 from foajax.config.schema import Config
 from foajax.envs.base import Environment
 from foajax.envs.make import make_environments
-from foajax.launch.processes import Job, Watch
+from foajax.launch.processes import Job, PeerWatch
 from foajax.launch.signals import StopRequest
 from foajax.learning.agent import Agent
 from foajax.learning.learner import Metrics
@@ -45,7 +45,7 @@ class Run:
         self._config, self._job, self._journal = config, job, Journal()
         self._layout = Layout(job.devices, job.local_devices) if len(job.devices) > 1 else None
         self._saving = Saving(config, job, self._layout, run_dir, self._journal.warn)
-        env_steps = int(job.tell("saved", str(self._saving.newest())))
+        env_steps = int(job.broadcast_text("saved", str(self._saving.newest())))
         self.progress = Progress(env_steps, EpisodeTracker(config.env.num_envs))
         self._stop_agreed = False  # by several processes, which stop after the same rollout
         environments = self._make_environments(resources)
@@ -53,7 +53,7 @@ class Run:
         self._programs = make_programs(self._agent, self._layout)
         self._collector = Collector(self._agent, self._programs, environments, seed=config.seed, part=job.index)
         self.progress.state = self._first_state()
-        self._watch = Watch(job, config.distributed.timeout, self._saving.rescue)
+        self._watch = PeerWatch(job, config.distributed.timeout, self._saving.rescue)
         with self._watch.expecting_others():
             self._saving.restore(self.progress, self._collector)
         is_new = not self.progress.env_steps and config.train.init_from is None
@@ -81,8 +81,8 @@ class Run:
         config, job = self._config, self._job
         state = make_state(self._agent, config.seed)
         if (path := config.train.init_from) is not None and not self.progress.env_steps:
-            begun = job.by_first("parameters", lambda: begin_from(path, state, config))
-            state = job.share(state if begun is None else begun)
+            begun = job.run_on_first("parameters", lambda: begin_from(path, state, config))
+            state = job.broadcast(state if begun is None else begun)
         return self._layout.replicate(state) if self._layout else state
 
     def _open(self, run_dir: RunDir | None, resources: contextlib.ExitStack) -> Dump | None:

@@ -82,14 +82,16 @@ class Saving:
         games = self._job.gather(collector.get_state())
         template = self._arrays(progress.state, games)
         checkpoints = self.checkpoints
-        restored = self._job.by_first("checkpoints", lambda: checkpoints.restore(template) if checkpoints else None)
-        found = json.loads(self._job.tell("restored", json.dumps(restored and [restored.env_steps, restored.meta])))
+        restored = self._job.run_on_first("checkpoints", lambda: checkpoints.restore(template) if checkpoints else None)
+        found = json.loads(
+            self._job.broadcast_text("restored", json.dumps(restored and [restored.env_steps, restored.meta]))
+        )
         if found is None:
             progress.env_steps, progress.games = 0, games
             return
         env_steps, meta = found
-        arrays = self._job.share(restored.state if restored is not None else template)
-        collector.set_state(self._job.mine(arrays["collector"]))
+        arrays = self._job.broadcast(restored.state if restored is not None else template)
+        collector.set_state(self._job.local_part(arrays["collector"]))
         progress.tracker.set_state(meta["tracker"], same_games=collector.resumable)
         progress.state = self._layout.replicate(arrays["train"]) if self._layout else arrays["train"]
         progress.env_steps, progress.games = env_steps, arrays["collector"]

@@ -69,7 +69,7 @@ def start(config: Config) -> None:
         stop = resources.enter_context(StopRequest())
         command = [sys.executable, *sys.argv]
         devices = [device.device_kind for device in job.devices]
-        run_dir = job.by_first(
+        run_dir = job.run_on_first(
             "run", lambda: resources.enter_context(open_run(config, command=command, devices=devices))
         )
         try:

@@ -203,7 +203,7 @@ def test_a_collective_that_fails_ends_a_process_whatever_it_raises(monkeypatch, 
     monkeypatch.setattr(distributed.os, "_exit", end)
     job = object.__new__(distributed.Job)
     job.index, job.count = 0, count
-    watch = distributed.Watch(job, 1000.0, lambda: "saved")
+    watch = distributed.PeerWatch(job, 1000.0, lambda: "saved")
     with pytest.raises(Ended if ends else type(error)) as caught, watch.expecting_others():
         raise error
     assert caught.value.args == (75,) if ends else caught.value is error

@@ -51,7 +51,7 @@ def make(tmp_path):
         path.mkdir()
         config = compose([f"run={path}", "train.env_steps=100", "game=seek"])
         (path / "config.yaml").write_text(yaml.safe_dump(to_mapping(config)))
-        return sweep.Run((str(path), what), config)
+        return sweep.PlannedRun((str(path), what), config)
 
     return one
 
@@ -71,7 +71,9 @@ def test_one_after_another_or_some_at_a_time(make):
 
 def test_a_run_that_cannot_be_started_does_not_end_the_sweep(make, tmp_path, capsys):
     (tmp_path / "file").touch()
-    lost = sweep.Run((str(tmp_path), "finish"), compose([f"run={tmp_path / 'file' / 'run'}", "train.env_steps=100"]))
+    lost = sweep.PlannedRun(
+        (str(tmp_path), "finish"), compose([f"run={tmp_path / 'file' / 'run'}", "train.env_steps=100"])
+    )
     good = make("good", "finish")
     assert sweep.run_all([lost, good], jobs=2, command=COMMAND) == 1
     assert len(times(good)) == 2
