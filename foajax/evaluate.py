@@ -20,10 +20,10 @@ from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config.parse import Section, replace
+from foajax.config.parse import replace
 from foajax.config.schema import SearchConfig
 from foajax.envs.measures import summarise
-from foajax.runs.agents import load_agent
+from foajax.runs.agents import StoredAgent
 from foajax.viewing.games import play
 
 # What may differ from training: the rest of `env` decides what a frame is.
@@ -33,19 +33,14 @@ _PROTOCOL = (
 )
 
 
-class Options(Section):
-    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+class Options(StoredAgent):
     episodes: int = Field(100, ge=1, description="Games to play.")
     policy: Literal["sampled", "greedy"] = Field(
         "sampled", description="How actions are chosen; greedy games differ by their no-ops at the start alone."
     )
-    checkpoint: Literal["newest", "best"] = Field(
-        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
-    )
     json_file: str | None = Field(None, alias="json", description="JSON file to write the result to.")
     num_envs: int = Field(25, ge=1, description="Games played at once.")
     seed: int = Field(0, description="Seed of the games.")
-    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
     def check(self) -> None:
         cli.check_file("json", self.json_file)
@@ -54,7 +49,7 @@ class Options(Section):
 def evaluate(arguments: Sequence[str]) -> None:
     protocol = [word for word in arguments if word.startswith(("env.", "search."))]
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
-    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
+    stored = options.load()
     config = stored.agent.config
     env, scenes = ([word for word in protocol if word.startswith(part)] for part in ("env.", "search."))
     config = replace(

@@ -15,21 +15,16 @@ from typing import Literal
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import Section, refuse
-from foajax.runs.agents import load_agent
+from foajax.config.parse import refuse
+from foajax.runs.agents import StoredAgent
 
 
-class Options(Section):
-    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+class Options(StoredAgent):
     out: str = Field(description="Directory of the folder to write.")
-    checkpoint: Literal["newest", "best"] = Field(
-        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
-    )
     dtype: Literal["float32", "float16", "int8"] = Field(
         "float32", description="Type of the weights; float16 halves the file, int8 thirds it and is less exact."
     )
     stablehlo: bool = Field(False, description="Write the whole decision as a program for JAX too.")
-    trust: bool = Field(False, description="Let code run that the run's configuration names.")
 
 
 def export(arguments: Sequence[str]) -> None:
@@ -41,7 +36,7 @@ def export(arguments: Sequence[str]) -> None:
         raise refuse("export", accepted="", why=f"{error.name} is missing (pip install 'foajax[robot]')") from None
     from foajax.robot import folder
 
-    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
+    stored = options.load()
     found = folder.write(
         stored,
         Path(options.out),

@@ -12,26 +12,23 @@ from typing import Literal
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import Section
-from foajax.runs.agents import load_agent
+from foajax.runs.agents import StoredAgent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing.player_page import write_page
 from foajax.viewing.recording import progress_bar, watch
 
 
-class Options(Section):
-    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+class Options(StoredAgent):
     out: str = Field("player", description="Directory of the page.")
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
     seed: int = Field(0, description="Seed of the game.")
     steps: int | None = Field(None, ge=1, description="Cut the game after so many decisions; null for the whole game.")
-    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
 
 def player(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored, directory = load_agent(options.run, trust=options.trust), cli.make_directory(options.out)
+    stored, directory = options.load(), cli.make_directory(options.out)
     with progress_bar() as bar:
         greedy = options.policy == "greedy"
         recording = next(watch(stored, bar, seed=options.seed, greedy=greedy, max_steps=options.steps))

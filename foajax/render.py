@@ -15,8 +15,8 @@ from typing import Literal
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import Section, refuse
-from foajax.runs.agents import load_agent
+from foajax.config.parse import refuse
+from foajax.runs.agents import StoredAgent
 from foajax.runtime import use_compilation_cache
 from foajax.viewing import heatmap
 from foajax.viewing.recording import progress_bar, watch
@@ -24,8 +24,7 @@ from foajax.viewing.scanpath import draw_scanpath
 from foajax.viewing.video import why_no_mp4, write_video
 
 
-class Options(Section):
-    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+class Options(StoredAgent):
     out: str | None = Field(None, description="Directory of the files; null for render/ in the run's.")
     episodes: int = Field(1, ge=1, description="Games to play.")
     policy: Literal["sampled", "greedy"] = Field("sampled", description="How actions are chosen.")
@@ -35,7 +34,6 @@ class Options(Section):
         None, description="Format of videos; null for mp4 where it can be written."
     )
     video: bool = Field(True, description="Write videos; false for the pictures alone.")
-    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
 
     def check(self) -> None:
         if self.format == "mp4" and (why := why_no_mp4()):
@@ -45,7 +43,7 @@ class Options(Section):
 def render(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     use_compilation_cache()
-    stored = load_agent(options.run, trust=options.trust)
+    stored = options.load()
     directory = cli.make_directory(options.out or Path(options.run) / "render")
     suffix = options.format or ("gif" if why_no_mp4() else "mp4")
     recordings, written = [], []

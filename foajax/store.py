@@ -10,13 +10,13 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import Section, refuse
-from foajax.runs.agents import FACTS, TrainedAgent, load_agent, load_score, save_agent
+from foajax.config.parse import refuse
+from foajax.runs.agents import FACTS, StoredAgent, TrainedAgent, load_score, save_agent
 from foajax.runs.directory import PARAMETERS
 
 
@@ -34,23 +34,18 @@ def _read_score(file: Path, stored: TrainedAgent) -> dict[str, Any]:
     return score
 
 
-class Options(Section):
-    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+class Options(StoredAgent):
     out: str = Field(description="Directory of the agent.")
-    checkpoint: Literal["newest", "best"] = Field(
-        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
-    )
     score: str | None = Field(None, description="File that `evaluate json=` has written, to go with the agent.")
-    trust: bool = Field(False, description="Let code run that the run's configuration names.")
 
 
-def export(arguments: Sequence[str]) -> None:
+def store(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
-    stored = load_agent(options.run, best=options.checkpoint == "best", trust=options.trust)
+    stored = options.load()
     score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)
     save_agent(stored, Path(options.out), score)
     print(f"{options.out}: {PARAMETERS}, config.yaml, {FACTS}")
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(export))
+    sys.exit(cli.run(store))

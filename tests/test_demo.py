@@ -99,15 +99,15 @@ def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
     facts = {"game": config.game, "experiment": config.name, "env_steps": stored.env_steps, "returns": [9.0], "seed": 0}
     (tmp_path / "score.json").write_text(json.dumps(EVALUATED | facts))
     words = [f"run={shipped / 'untold'}", f"out={tmp_path / 'again'}"]
-    assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 0
+    assert cli.run(store.store, [*words, f"score={tmp_path / 'score.json'}"]) == 0
     assert agents.load_score(tmp_path / "again") == EVALUATED and agents.load_score(shipped / "untold") is None
-    assert cli.run(store.export, [f"run={tmp_path / 'again'}", f"out={tmp_path / 'third'}"]) == 0
+    assert cli.run(store.store, [f"run={tmp_path / 'again'}", f"out={tmp_path / 'third'}"]) == 0
     assert agents.load_score(tmp_path / "third") == EVALUATED
     (tmp_path / "score.json").write_text(json.dumps(EVALUATED | facts | {"game": "chess"}))
-    assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 2
+    assert cli.run(store.store, [*words, f"score={tmp_path / 'score.json'}"]) == 2
     assert "is of {'game': 'chess'" in capsys.readouterr().err
     (tmp_path / "score.json").write_text("{}")
-    assert cli.run(store.export, [*words, f"score={tmp_path / 'score.json'}"]) == 2
+    assert cli.run(store.store, [*words, f"score={tmp_path / 'score.json'}"]) == 2
     assert "accepted is a file that foajax evaluate json=<file> has written" in capsys.readouterr().err
 
 

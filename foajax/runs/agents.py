@@ -11,17 +11,18 @@ import itertools
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
 from jaxtyping import Int
+from pydantic import Field
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from foajax.config.parse import ConfigError, flatten, refuse, replace, to_mapping
+from foajax.config.parse import ConfigError, Section, flatten, refuse, replace, to_mapping
 from foajax.config.schema import Config
 from foajax.config.shipped import agents
 from foajax.learning.agent import Agent
@@ -154,6 +155,20 @@ def check_trust(path: Path, config: Config, trust: bool) -> None:
     if config.code and not trust:
         why = f"it would run the code {', '.join(config.code)}"
         raise refuse("run", path, "trust=true if you trust its author", why=why)
+
+
+class StoredAgent(Section):
+    """Keys of a command that reads an agent."""
+
+    run: str = Field(description="Directory of a run or an agent, or a shipped agent's name.")
+    checkpoint: Literal["newest", "best"] = Field(
+        "newest", description="Which checkpoint of a run: the newest, or the one with the best score in training."
+    )
+    trust: bool = Field(False, description="Let code run that the agent's configuration names.")
+
+    def load(self) -> TrainedAgent:
+        """Reads the agent; raises as `load_agent`."""
+        return load_agent(self.run, best=self.checkpoint == "best", trust=self.trust)
 
 
 def load_agent(path: str | Path, *, best: bool = False, trust: bool = False, key: str = "run") -> TrainedAgent:

@@ -98,7 +98,7 @@ def test_the_best_so_far_is_kept_over_starts(run):
     left = Checkpoints(run / "checkpoints", keep=None).steps()
     assert left == [steps[0], 16000] and score(run, steps[0]) == 999.0
     assert load_agent(run).env_steps == 16000 and load_agent(run, best=True).env_steps == steps[0]
-    assert cli.run(store.export, [f"run={run}", f"out={run}-best", "checkpoint=best"]) == 0
+    assert cli.run(store.store, [f"run={run}", f"out={run}-best", "checkpoint=best"]) == 0
     assert load_agent(f"{run}-best").env_steps == steps[0]
 
 
