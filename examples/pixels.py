@@ -6,8 +6,8 @@ r"""Turns environments of other libraries into pixels with discrete actions, for
     foajax train game=gymnasium:pixels:Driving env.clip_rewards=false experiment=constant70_packed env.num_envs=8 \
         learner.num_minibatches=4 learner.warmup_updates=100 learner.value_weight=0.05
 
-Driving is slow to emulate, so few environments and a short warm-up let the learner start early. Its returns are in tens:
-a small `learner.value_weight` keeps errors of values from drowning the policy.
+Driving is slow to emulate, so few environments and a short warm-up let the learner start early. Its returns are in
+tens: a small `learner.value_weight` keeps errors of values from drowning the policy.
 """
 
 from __future__ import annotations
