@@ -297,7 +297,7 @@ def test_games_go_by_any_of_their_names():
             {},
             r"game=gymnasium:no_such_module:X-v0: .*pip install no_such_module",
         ),
-        ("gymnasium:Sized-v0", {}, r"game=gymnasium:Sized-v0: .*'shape'.*accepted is the id of an environment"),
+        ("gymnasium:Sized-v0", {}, r"game=gymnasium:Sized-v0: .*'shape'.*accepted is env.kwargs that the"),
         ("gymnasium:CartPole-v1", {}, r"game=gymnasium:CartPole-v1: accepted is .* uint8 images .*, not Box"),
     ],
 )
