@@ -77,7 +77,7 @@ def test_what_cannot_be_sensed_is_refused_as_jax_refuses_it(arguments, message):
 
 
 def test_a_sensor_of_ones_own_is_left_to_jax():
-    with pytest.raises(ConfigError, match="^sensor=.*foajax.sense takes one's own"):
+    with pytest.raises(ConfigError, match="^sensor=.*foajax.sense takes your own"):
         foajax.numpy.sense(noise((40, 32)), np.array([9, 9]), sensor=OwnSensor(kind="mine:Random"))
 
 

@@ -173,7 +173,7 @@ def test_what_is_no_visual_action_is_refused_before_the_step(action):
     single, vector = FoveatedObservation(Noise(), FULL, GAZE), make_vector()
     single.reset(seed=0)
     vector.reset(seed=0)
-    with pytest.raises(ValueError, match=r"^vision=.*: accepted is integers \[\] from 0 to 4$"):
+    with pytest.raises(ValueError, match=r"^vision=.*: accepted is an integer from 0 to 4$"):
         single.step({"natural": 0, "vision": action})
     with pytest.raises(ValueError, match=r"^vision=.*: accepted is integers \[2\] from 0 to 4$"):
         vector.step({"natural": np.zeros(2, int), "vision": [action, action]})
