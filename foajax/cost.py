@@ -62,6 +62,7 @@ def has_atari_frames(experiment: str) -> bool:
 
 
 def cost(arguments: Sequence[str]) -> None:
+    """Measures each experiment and prints a table of what a decision costs."""
     options = cli.parse(Options, arguments)
     wait_in_place()
     if options.target == "onnx":

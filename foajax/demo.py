@@ -67,6 +67,7 @@ def choose(directory: Path, game: str | None) -> Path:
 
 
 def demo(arguments: Sequence[str]) -> None:
+    """Plays a game; prints the score, the page's address and what to look at."""
     options = cli.parse(Options, arguments)
     path = Path(options.agent) if options.agent else choose(agents(), options.game)
     stored, directory = load_agent(path, trust=options.trust, key="agent"), cli.make_directory(options.out)

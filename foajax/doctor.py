@@ -37,6 +37,7 @@ class Options(Section):
 
 
 def doctor(arguments: Sequence[str]) -> int:
+    """Prints versions, devices, free space and extras; returns 1 if a package that foajax needs is missing, else 0."""
     cli.parse(Options, arguments)
     table, missing = Table.grid(padding=(0, 2)), list(_missing("foajax"))
     rows = {

@@ -47,6 +47,7 @@ class Options(StoredAgent):
 
 
 def evaluate(arguments: Sequence[str]) -> None:
+    """Plays whole games and prints a table of their scores."""
     protocol = [word for word in arguments if word.startswith(("env.", "search."))]
     options = cli.parse(Options, [word for word in arguments if word not in protocol])
     stored = options.load()

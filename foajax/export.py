@@ -28,6 +28,7 @@ class Options(StoredAgent):
 
 
 def export(arguments: Sequence[str]) -> None:
+    """Writes the folder, checks it, and prints what it wrote."""
     options = cli.parse(Options, arguments)
     try:
         import onnx  # noqa: F401

@@ -29,6 +29,7 @@ class Options(Section):
 
 
 def keep(arguments: Sequence[str]) -> None:
+    """Keeps a run, if one is named, and writes all tables and pages anew; prints where the run is kept."""
     options = cli.parse(Options, arguments)
     if not kept.KEPT.is_dir():
         raise refuse(str(kept.KEPT), accepted="a checkout of foajax, which has this directory", why="is missing")

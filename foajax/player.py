@@ -26,6 +26,7 @@ class Options(StoredAgent):
 
 
 def player(arguments: Sequence[str]) -> None:
+    """Plays one game and prints the path of its page."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
     stored, directory = options.load(), cli.make_directory(options.out)

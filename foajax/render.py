@@ -41,6 +41,7 @@ class Options(StoredAgent):
 
 
 def render(arguments: Sequence[str]) -> None:
+    """Plays games and prints the paths of their videos and pictures."""
     options = cli.parse(Options, arguments)
     use_compilation_cache()
     stored = options.load()

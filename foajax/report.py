@@ -36,6 +36,7 @@ class Options(Section):
 
 
 def report(arguments: Sequence[str]) -> None:
+    """Writes the page and prints its path."""
     paths, others = cli.split(arguments)
     options = cli.parse(Options, others)
     if not paths:

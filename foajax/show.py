@@ -60,6 +60,7 @@ def walk(config: Config, steps: int) -> np.ndarray:
 
 
 def show(arguments: Sequence[str]) -> None:
+    """Draws what sensors see and prints the path of the picture."""
     own = [word for word in arguments if word.startswith("sensor.")]
     options = cli.parse(Options, [word for word in arguments if word not in own])
     sheet = options.all or options.sensor == "all"

@@ -59,6 +59,7 @@ class Options(Section):
 
 
 def status(arguments: Sequence[str]) -> None:
+    """Prints the table of runs; on a terminal keeps it live until Ctrl-C."""
     directories, others = cli.split(arguments)
     options, directories = cli.parse(Options, others), directories or ["runs"]
     console = Console(highlight=False)

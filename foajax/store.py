@@ -40,6 +40,7 @@ class Options(StoredAgent):
 
 
 def store(arguments: Sequence[str]) -> None:
+    """Writes the agent and prints where."""
     options = cli.parse(Options, arguments)
     stored = options.load()
     score = load_score(options.run) if options.score is None else _read_score(Path(options.score), stored)
