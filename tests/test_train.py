@@ -16,6 +16,7 @@ from processes import TINY, finish, has_rows, rows, start, wait_for
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
 from foajax.launch.processes import Job
+from foajax.launch.signals import StopRequest
 from foajax.runs.agents import load_agent, save_agent
 from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import load_config, open_run
@@ -117,6 +118,16 @@ def test_a_resumed_run_has_all_of_the_learners_state_where_games_start_anew(brea
     assert state.updates == env_steps / 40 * 2 * 2 and state.opt_state.count == state.updates
     assert env_steps == saved.env_steps == rows(path)[-1]["env_steps"] >= 1000
     assert tracker == saved.meta["tracker"] | {name: [0] * 8 for name in ("scores", "lengths")}
+
+
+def test_a_run_whose_environments_are_slow_to_close_says_its_end_once(breakout, tmp_path, capsys):
+    config = load_config(shutil.copytree(breakout[0], tmp_path / "run"))
+    with contextlib.ExitStack() as resources:
+        run = Run(config, Job(config), resources.enter_context(open_run(config, command=[])), resources)
+        run.loop(StopRequest())
+        assert run._abandon("SIGTERM", 0) == 0  # as the watchdog does
+    said = "".join(capsys.readouterr())
+    assert said.count("done: 1,000 env_steps") == 1 and "SIGTERM" not in said
 
 
 def test_evaluation_plays_whole_games(breakout, tmp_path):

@@ -48,6 +48,7 @@ class Run:
         env_steps = int(job.broadcast_text("saved", str(self._saving.newest())))
         self.progress = Progress(env_steps, EpisodeTracker(config.env.num_envs))
         self._stop_agreed = False  # by several processes, which stop after the same rollout
+        self._has_said_end = False
         environments = self._make_environments(resources)
         self._agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
         self._programs = make_programs(self._agent, self._layout)
@@ -113,6 +114,7 @@ class Run:
             raise ConfigError(self._unsaved())
         asked = stop.name or ("a signal to another process" if self._stop_agreed else None)
         self._journal.say(self._how_it_ends(asked))
+        self._has_said_end = True
 
     def _loop(self, stop: StopRequest) -> None:
         config, at = self._config, self.progress
@@ -210,7 +212,8 @@ class Run:
         if code:
             report_fault(self._config, why, None)
         elif self._saving.is_saved(self.progress):
-            self._journal.say(self._how_it_ends(why))
+            if not self._has_said_end:  # it has where only closing the environments is slow
+                self._journal.say(self._how_it_ends(why))
             return code
         else:
             why, code = self._unsaved(), 2
