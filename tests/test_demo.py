@@ -103,6 +103,8 @@ def test_an_agent_is_stored_with_its_evaluation(shipped, tmp_path, capsys):
     assert agents.load_score(tmp_path / "again") == EVALUATED and agents.load_score(shipped / "untold") is None
     assert cli.run(store.store, [f"run={tmp_path / 'again'}", f"out={tmp_path / 'third'}"]) == 0
     assert agents.load_score(tmp_path / "third") == EVALUATED
+    modes = {file.name: file.stat().st_mode for file in (tmp_path / "third").iterdir()}
+    assert modes["agent.safetensors"] == modes["config.yaml"]  # who can read the one can read the other
     (tmp_path / "score.json").write_text(json.dumps(EVALUATED | facts | {"game": "chess"}))
     assert cli.run(store.store, [*words, f"score={tmp_path / 'score.json'}"]) == 2
     assert "is of {'game': 'chess'" in capsys.readouterr().err
@@ -136,7 +138,7 @@ def test_a_shipped_agent_can_be_read_and_has_its_score(path):
 
 @pytest.mark.slow
 def test_a_shipped_agent_plays_as_well_as_it_says():
-    stored = agents.load_agent(demo.agents() / "pong-nonfoa")
+    stored = agents.load_agent(demo.agents() / "pong-constant70_p_packed")
     played = games.play(stored, episodes=2, num_envs=2, seed=0, greedy=False)
     assert played.returns.mean() > 10
 

@@ -16,7 +16,7 @@ from foajax.runs.agents import TrainedAgent, load_agent
 from foajax.viewing import games
 from foajax.viewing.games import Games, play
 
-PONG = shipped.agents() / "pong-constant70_packed"
+PONG = shipped.agents() / "pong-constant70_p_packed"
 
 
 @pytest.fixture(scope="module")

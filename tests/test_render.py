@@ -62,7 +62,7 @@ def test_an_ffmpeg_that_does_not_run_is_found_before_the_game_is_played(monkeypa
     pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg (extra `video`) is not installed")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
     why_no_mp4.cache_clear()
-    assert cli.run(render.render, ["run=pong-constant70_packed", "format=mp4"]) == 2
+    assert cli.run(render.render, ["run=pong-constant70_p_packed", "format=mp4"]) == 2
     said = capsys.readouterr().err
     assert "format=mp4: the ffmpeg of imageio-ffmpeg does not run" in said and "accepted is gif" in said
     assert said.count("\n") == 1

@@ -20,7 +20,7 @@ import yaml
 from jaxtyping import Int
 from pydantic import Field
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from foajax.config.parse import ConfigError, Section, flatten, refuse, replace, to_mapping
 from foajax.config.schema import Config
@@ -175,7 +175,7 @@ def load_agent(path: str | Path, *, best: bool = False, trust: bool = False, key
     """Reads a trained agent.
 
     Args:
-      path: a directory of a run or an agent, or the name of a shipped agent, e.g. `pong-constant70_packed`.
+      path: a directory of a run or an agent, or the name of a shipped agent, e.g. `pong-constant70_p_packed`.
       best: of a run, read the checkpoint with the best score in training, not the newest.
       trust: whether code that the agent's configuration names (`package.module:Name`) may run.
       key: the key that named it, for the message where there is none.
@@ -254,7 +254,7 @@ def save_agent(stored: TrainedAgent, directory: Path, score: Mapping[str, Any] |
     known = {} if score is None else {"score": dict(score)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        save_file(named((stored.params, stored.statistics)), directory / PARAMETERS)
+        (directory / PARAMETERS).write_bytes(save(named((stored.params, stored.statistics))))
         (directory / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
         save_facts(stored.agent, directory, env_steps=stored.env_steps, **known)
     except (OSError, SafetensorError) as error:

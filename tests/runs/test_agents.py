@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import shutil
 import sys
+from pathlib import Path
 
 import chex
 import jax
 import numpy as np
 import pytest
 import yaml
+from safetensors.numpy import save_file
 
 from foajax import cli, evaluate, player
 from foajax.config.parse import ConfigError, replace, to_mapping
@@ -21,7 +24,9 @@ from foajax.runs.agents import begin_from, load_agent, save_agent
 from foajax.runs.directory import load_config
 from foajax.types import TimeStep, TrainState
 
-PONG = "pong-constant70_packed"
+PONG = "pong-constant70_p_packed"
+BEFORE = Path(__file__).parents[1] / "data" / "shipped_before"
+VALUES = [[-0.02670, 0.28586], [0.09523, -0.00696], [-0.27053, -0.12366], [-0.23351, 0.48221], [0.31303, -0.21762]]
 NAMED = {
     "game": "evil:game",
     "sensor": {"kind": "evil:Sensor", "kwargs": {}},
@@ -102,6 +107,26 @@ def test_a_shipped_agent_is_found_by_its_name_from_any_directory(pong, tmp_path,
 
 def screens(seed, batch=2):
     return np.random.default_rng(seed).integers(0, 255, (batch, 210, 160)).astype(np.uint8)
+
+
+def test_an_agent_that_was_shipped_before_decides_as_it_did(tmp_path):
+    """Configuration and shapes are those of Pong's first agent, `VALUES` from the code that shipped it (375e4e9)."""
+    shapes = json.loads((BEFORE / "shapes.json").read_text())
+    rng = np.random.default_rng(0)
+    arrays = {name: np.asarray(rng.normal(0, 0.1, shape), np.float32) for name, shape in shapes.items()}
+    statistics = {"1/weight": 1.0, "1/mean": 0.3, "1/std": 0.2}
+    arrays |= {name: np.array(value, np.float32) for name, value in statistics.items()}
+    shutil.copytree(BEFORE, tmp_path / "agent")
+    save_file(arrays, tmp_path / "agent" / "agent.safetensors")
+    before = load_agent(tmp_path / "agent")
+    state, values = before.agent.initial_state(2), []
+    for t in range(len(VALUES)):
+        timestep = TimeStep(screens(t), np.zeros(2, np.float32), np.array([t == 0, t in (0, 3)]), np.zeros(2, bool))
+        key = jax.random.key(t)
+        _, output, state = before.agent.act(before.params, before.statistics, state, timestep, key, greedy=True)
+        values.append(output.natural_value)
+    np.testing.assert_allclose(values, VALUES, atol=1e-5)
+    assert state.focal_point.tolist() == [[36, 40], [40, 40]]
 
 
 @pytest.mark.parametrize("greedy", [True, False])

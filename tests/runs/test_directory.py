@@ -137,7 +137,10 @@ def test_a_run_with_words_of_before_is_read(config):
     open_run(other, command=COMMAND).close()  # and goes on
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("agents/*/config.yaml")), ids=lambda path: path.parent.name)
+SHIPPED = [*sorted(ROOT.glob("agents/*/config.yaml")), ROOT / "tests/data/shipped_before/config.yaml"]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.parent.name)
 def test_a_shipped_agent_is_read_with_all_that_its_file_says(path):
     said = dict(flatten(renamed(yaml.safe_load(path.read_text())))) | {"run": str(path.parent)}
     assert said.items() <= dict(flatten(to_mapping(load_config(path.parent)))).items()
