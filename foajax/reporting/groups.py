@@ -18,7 +18,7 @@ PRESETS = {
     "decreasing": ("constant70", "decreasing"),
     "peripheral": ("constant70_p", "decreasing_p", "constant70", "decreasing"),
 }
-_NOT_COMPARED = FREE | {"seed", "game", "name"}
+_NOT_COMPARED = FREE | {"seed", "game"}
 Groups = dict[str, list[RunData]]  # seeds of the same experiment, by the experiment's name
 
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from foajax.config import shipped
-from foajax.config.parse import refuse
+from foajax.config.parse import flatten, refuse, to_mapping
+from foajax.config.schema import LearnerConfig
 from foajax.reporting import claims, kept, search
 from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
 from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, save
@@ -105,7 +106,7 @@ def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
         *(_section(claim, findings[claim.title]) for claim in CLAIMS),
         *(_game(games[game], costs) if game in games else f"## {GAMES[game]}\nNot run yet." for game in GAMES),
         _SENSORS,
-        _protocol([run for game in games.values() for seeds in game.runs.values() for run in seeds]),
+        _protocol(games),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -139,17 +140,26 @@ _PROTOCOL = """\
 [results/runs](../results/runs/README.md) has commands, commits and machines of all runs."""
 
 
-def _protocol(runs: Sequence[RunData]) -> str:
-    facts = [kept.record(run) for run in runs]
+def _protocol(games: Mapping[str, Game]) -> str:
+    facts = [kept.record(run) for game in games.values() for seeds in game.runs.values() for run in seeds]
 
     def each(values: Iterable[str]) -> str:
         return ", ".join(sorted(set(values)))
 
     text = _PROTOCOL
+    for game in games.values():  # whose runs share one learner: see `_check_protocol`
+        if words := _unlike_default(next(iter(game.runs.values()))[0].config.learner):
+            text += f"\n\nOn {GAMES[game.name]} the learner was today's default with {', '.join(words)}."
     if facts:
         pythons, cpus = each(fact["python"] for fact in facts), each(fact["cpu"] for fact in facts)
         text += f"\n\nPython {pythons}, jax {each(fact['packages']['jax'] for fact in facts)}, {cpus}."
     return text
+
+
+def _unlike_default(learner: LearnerConfig) -> list[str]:
+    today = dict(flatten(to_mapping(LearnerConfig())))
+    then = flatten(to_mapping(learner))
+    return [f"`learner.{key}={json.dumps(value)}`" for key, value in then if value != today[key]]
 
 
 def _verdicts(chosen: Sequence[Claim], findings: Mapping[str, Mapping[str, Finding]], head: str) -> str:
@@ -259,13 +269,26 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str 
     counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in found if verdict in verdicts)
     return (
         f"On Breakout a learned gaze scores {learned / frozen:.1f} times as much as a frozen one, and "
-        f"{learned / whole:.2f} of what the whole frame\nscores. Both gazes see a fifth of its values.\n\n"
+        f"{learned / whole:.2f} of what the whole frame\nscores. Both gazes see a fifth of its values.{_best(game)}\n\n"
         "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
         f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
         f"Score: mean of 100 whole games. Brackets: 95 % intervals {over_what}.\n"
         "Ratios are of scores above random play.\n\n"
         f"The paper's {len(verdicts)} claims on Breakout: {'; '.join(counts)}. [All results](docs/results.md).\n"
     )
+
+
+def _best(game: Game) -> str:
+    """Says which of the paper's sensors with a gaze scores best; "" before all of them were run."""
+    if not game.runs.keys() >= PAPER_NAMES.keys():
+        return ""
+    scores = {label: claims.above_chance(claims.score(game.runs[label]), game.name).value for label in PAPER_NAMES}
+    whole = scores.pop("nonfoa")
+    best = max(scores, key=scores.__getitem__)
+    config = game.runs[best][0].config
+    values = make_sensor(config.sensor).count(config.env.frame_shape).nominal
+    share = f"{scores[best] / whole:.2f} of the whole frame"
+    return f" Of the paper's six sensors with a gaze\n`{best}` scores best: {share}, from {values:,} values."
 
 
 def draw(games: Mapping[str, Game], directory: Path) -> None:

@@ -39,7 +39,7 @@ _BEFORE = {
 }
 # What may change between two starts of a run: none of it changes what a step learns.
 FREE = {
-    *("run", "profile", "env.threads", "env.timeout"),
+    *("name", "run", "profile", "env.threads", "env.timeout"),
     *("train.env_steps", "train.log_every", "train.checkpoint_every", "train.keep_checkpoints"),
     *("train.max_skipped", "train.dump_skipped"),
     *("train.devices", *(f"distributed.{key}" for key in ("coordinator", "processes", "process", "timeout"))),

@@ -58,7 +58,8 @@ APART += ["natural.gamma=0.9", "natural.gae_lambda=0", "natural.entropy_weight=0
 APART += ["vision.gamma=0.5", "vision.gae_lambda=0", "vision.entropy_weight=0.03"]
 
 
-def test_the_loss_is_that_of_each_step_where_episodes_end(seek):
+@pytest.mark.parametrize("normalises", [False, True])
+def test_the_loss_is_that_of_each_step_where_episodes_end(seek, normalises):
     """Lambda is 0: an advantage is a reward, the next value and the own one. The vision head's reward comes later."""
     (rollout,), _ = seek.collect()
     random, is_first, is_terminal = np.random.default_rng(0), *np.zeros((2, 7, 8), bool)
@@ -70,7 +71,7 @@ def test_the_loss_is_that_of_each_step_where_episodes_end(seek):
     new |= {f"{head}_log_prob": value for head, value in behaviour.items()}
     steps = rollout.steps._replace(**jax.tree.map(jnp.asarray, new))
     rollout = rollout._replace(steps=steps)
-    words = [f"learner.{word}" for word in APART]
+    words = [f"learner.{word}" for word in [*APART, f"normalize_advantages={normalises}"]]
     config = compose.compose([*SMALL, "game=seek", "experiment=constant50_sub2_packed", *words])
     agent = Agent(config, seek.agent.num_actions, seek.agent.crop_top)
     total, _ = jax.jit(lambda params: learner.loss(params, agent, rollout))(seek.state.params)
@@ -90,7 +91,7 @@ def test_the_loss_is_that_of_each_step_where_episodes_end(seek):
         log_p = np.asarray(jax.nn.log_softmax(getattr(output, f"{head}_logits")))[:-1]
         chosen = np.take_along_axis(log_p, np.asarray(getattr(steps, f"{head}_action"))[:-1, :, None], -1)[..., 0]
         ratio = np.exp(chosen - behaviour[head][:-1])
-        scaled = (advantage - advantage[acts].mean()) / advantage[acts].std()
+        scaled = (advantage - advantage[acts].mean()) / advantage[acts].std() if normalises else advantage
         gained = np.minimum(ratio * scaled, np.clip(ratio, 0.8, 1.2) * scaled)
         gained -= own.entropy_weight * (np.exp(log_p) * log_p).sum(-1)
         expected += weight * (0.7 * 0.5 * np.square(advantage[learns]).mean() - gained[acts].mean())

@@ -223,6 +223,7 @@ def test_what_means_the_same_is_taken_over(config):
     open_run(config, command=COMMAND).close()
     other = changed(
         config,
+        name="of_another_name",
         train__env_steps=7,
         train__log_every=1.5,
         train__checkpoint_every=2.5,
