@@ -4,10 +4,11 @@ r"""Turns environments of other libraries into pixels with discrete actions, for
     foajax train game=gymnasium:pixels:MiniGrid env.kwargs.task=MiniGrid-Empty-8x8-v0 experiment=constant50_sub2_packed
     MUJOCO_GL=egl foajax train game=gymnasium:pixels:Camera env.kwargs.task=InvertedPendulum-v5
     foajax train game=gymnasium:pixels:Driving env.clip_rewards=false experiment=constant70_packed env.num_envs=8 \
-        learner.num_minibatches=4 learner.warmup_updates=100 learner.value_weight=0.05
+        learner.num_minibatches=4 learner.warmup_updates=100 learner.value_weight=0.05 \
+        learner.normalize_advantages=true
 
 Driving is slow to emulate, so few environments and a short warm-up let the learner start early. Its returns are in
-tens: a small `learner.value_weight` keeps errors of values from drowning the policy.
+tens: a small `learner.value_weight` keeps errors of values from drowning the policy, and advantages are scaled down.
 """
 
 from __future__ import annotations

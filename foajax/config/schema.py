@@ -369,7 +369,9 @@ class LearnerConfig(Section):
         0.5, gt=0, description="Norm that the whole gradient is cut down to; null for no limit."
     )
     reduction: Literal["mean", "sum"] = Field("mean", description="Losses over time: their mean or their sum.")
-    normalize_advantages: bool = Field(True, description="Scale each minibatch's advantages to mean 0, deviation 1.")
+    normalize_advantages: bool = Field(
+        False, description="Scale each minibatch's advantages to mean 0, deviation 1; for rewards that are not clipped."
+    )
     value_weight: float = Field(0.5, ge=0, description="Weight of each head's value loss.")
     vision_weight: float = Field(
         0.25, ge=0, description="Weight of the vision head's whole loss, beside 1 of the natural head's."
