@@ -18,6 +18,7 @@ from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
 from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, save
 from foajax.reporting.groups import PRESETS, differing_keys, games_of
 from foajax.reporting.markdown import fill, table
+from foajax.reporting.scores import Interval
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import heatmap
 
@@ -225,21 +226,24 @@ def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str]:
-    runs, whole = game.runs[label], game.runs.get("nonfoa")
-    config, found = runs[0].config, claims.score(runs)
-    of_whole = whole and claims.over(
-        claims.above_chance(found, game.name), claims.above_chance(claims.score(whole), game.name)
-    )
+    runs = game.runs[label]
+    config = runs[0].config
+    of_whole = claims.over(_worth(game, label), _worth(game, "nonfoa")) if "nonfoa" in game.runs else None
     measured = (config.name.split("-")[0], config.network.torso)
     return [
         f"`{label}`",
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
         str(len(runs)),
-        str(found),
+        str(claims.score(runs)),
         str(of_whole) if of_whole and label != "nonfoa" else "",
         *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
         f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
     ]
+
+
+def _worth(game: Game, label: str) -> Interval:
+    """Returns an experiment's score above that of random play, which ratios are made of."""
+    return claims.above_chance(claims.score(game.runs[label]), game.name)
 
 
 def _cost(record: Mapping[str, Any] | None) -> list[str]:
@@ -259,9 +263,7 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str 
     for label in there:
         name = game.runs[label][0].config.name  # as it is typed, with `_packed`
         rows.append([f"{_GAZES[label]} (`{name}`)", *_row(game, label, costs)[1:5]])
-    whole, learned, frozen = (
-        claims.above_chance(claims.score(game.runs[label]), game.name).value for label in list(_GAZES)[:3]
-    )
+    whole, learned, frozen = (_worth(game, label).value for label in list(_GAZES)[:3])
     one = any(len(game.runs[label]) == 1 for label in there)
     over_what = "over seeds; where there is one seed, over its games" if one else "over seeds"
     verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
@@ -282,7 +284,7 @@ def _best(game: Game) -> str:
     """Says which of the paper's sensors with a gaze scores best; "" before all of them were run."""
     if not game.runs.keys() >= PAPER_NAMES.keys():
         return ""
-    scores = {label: claims.above_chance(claims.score(game.runs[label]), game.name).value for label in PAPER_NAMES}
+    scores = {label: _worth(game, label).value for label in PAPER_NAMES}
     whole = scores.pop("nonfoa")
     best = max(scores, key=scores.__getitem__)
     config = game.runs[best][0].config
