@@ -8,6 +8,7 @@ table of measurements in `results/bench/`. Without `run=` it does only that.
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +16,9 @@ from pathlib import Path
 from pydantic import Field
 
 from foajax import cli
-from foajax.config.parse import Section, refuse
+from foajax.config.parse import ConfigError, Section, refuse
 from foajax.reporting import bench, kept, results
+from foajax.reporting.curves import read_run
 
 
 class Options(Section):
@@ -33,8 +35,17 @@ def keep(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     if not kept.KEPT.is_dir():
         raise refuse(str(kept.KEPT), accepted="a checkout of foajax, which has this directory", why="is missing")
+    before = kept.runs()
     if options.run is not None:
-        print(kept.keep(Path(options.run), options.name))
+        new = kept.keep(Path(options.run), options.name)
+        others = [run for run in before if run.path != new]
+        try:
+            results.by_game([*others, read_run(new)])
+        except ConfigError:
+            if len(others) == len(before):
+                shutil.rmtree(new)
+            raise
+        print(new)
     runs = kept.runs()
     kept.write_table(runs)
     results.write(runs)

@@ -9,6 +9,7 @@ docs/results.md.
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from foajax.config.parse import Section, refuse
 from foajax.launch import sweep
 from foajax.reporting import kept
 from foajax.runs.directory import is_run
-from foajax.runs.status import inspect, is_finished
+from foajax.runs.status import RunStatus, inspect, is_finished
 
 _WATCHED = 10  # games in which a learned gaze is watched
 
@@ -63,10 +64,9 @@ def reproduce(arguments: Sequence[str]) -> int:
     failed = 0
     for about, runs in planned:
         if options.show == "commands":
-            print(
-                *(f"python -m foajax.train {' '.join(run.words)}" for run in runs if not is_finished(run.config)),
-                sep="\n",
-            )
+            for run in runs:
+                if not is_finished(run.config):
+                    print(f"python -m foajax.train {' '.join(run.words)}")
             continue
         print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
         failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs)
@@ -98,17 +98,23 @@ def _show(planned: Sequence[tuple[str, Sequence[sweep.PlannedRun]]]) -> int:
         for run in runs:
             path = Path(run.config.run_dir)
             known = inspect(path) if is_run(path) else None
-            score = yaml.safe_load(_score(run).read_text()) if _score(run).exists() else None
+            score = json.loads(_score(run).read_text()) if known and _score(run).exists() else None
             table.add_row(
                 about if run is runs[0] else "",
                 run.config.run_dir,
-                known.state if known else "not begun",
+                _state(run, known) if known else "not begun",
                 f"{known.env_steps:,}" if known else "",
-                f"{score['mean']:.3g} ± {score['stderr']:.2g}" if score else "",
+                kept.written(score) if known and score and score["env_steps"] == known.env_steps else "",
             )
         table.add_section()
     Console(width=140).print(table)
     return 0
+
+
+def _state(run: sweep.PlannedRun, known: RunStatus) -> str:
+    if known.state != "finished" or is_finished(run.config):
+        return known.state
+    return "too short" if known.env_steps < run.config.train.env_steps else "another run"
 
 
 if __name__ == "__main__":

@@ -18,7 +18,9 @@ from foajax.reporting.curves import RunData, on_common_axis
 from foajax.reporting.scores import CONFIDENCE, QUANTILES, REFERENCE, Interval, interval, resampled
 from foajax.viewing.heatmap import HeatMap
 
+_ANYTHING = Interval(math.nan, 0.0, math.inf)  # a ratio of which nothing is known
 SEEDS = 3  # of each experiment, for a verdict
+LEARNED = 0.02  # of the best score of a game, both above random play: who has less has not learned the game
 NOT_RUN = "not run yet"
 _CHANCE = ", ".join(f"{low} on {game}" for game, (low, _) in REFERENCE.items() if game != "seek")
 RULES = f"""\
@@ -29,12 +31,15 @@ RULES = f"""\
   is over its 100 games and says nothing about other seeds. Numbers from the curve or the heat map of one seed have no
   interval.
 - The interval of a ratio goes from the smallest to the largest ratio of values in the two intervals. So one score
-  counts as higher than another only if their intervals do not overlap.
+  counts as higher than another only if their intervals do not overlap. For how much longer learning takes, it is by
+  bootstrap over the seeds of both.
 - A claim *holds* if the whole interval is within the bounds of the claim. It *does not hold* if the whole interval is
   outside. Otherwise the runs *cannot tell*. A claim about two pairs has to hold for both.
+- An agent with less than {100 * LEARNED:.0f} % of the best score in the table, both above random play, has not learned
+  the game. Two such agents *cannot tell*.
 - These verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. With {SEEDS}, an interval goes
-  from the worst to the best seed. If two experiments were equal, the one that is claimed to be better would still seem
-  so by chance in one comparison of 20.
+  from the worst to the best seed, and holds the mean of all possible seeds three times in four. If two experiments
+  were equal, the one that is claimed to be better would still seem so by chance in one comparison of 20.
 - *{NOT_RUN.capitalize()}* means that a run which the claim needs is missing."""
 
 
@@ -83,7 +88,7 @@ def judge(parts: Sequence[Part | None], low: float, high: float) -> str:
     there = [part for part in parts if part is not None]
     if len(there) < len(parts):
         return NOT_RUN
-    within = all(low < part.found.low and part.found.high < high for part in there)
+    within = all(low < part.found.low and (part.found.high < high or high == math.inf) for part in there)
     outside = any(part.found.high <= low or high <= part.found.low for part in there)
     seeds = min(part.seeds for part in there)
     if seeds >= SEEDS:
@@ -113,10 +118,13 @@ def above_chance(score: Interval, game: str) -> Interval:
 
 
 def over(a: Interval, b: Interval) -> Interval:
-    """Divides a by b, negative values counted as 0; the interval goes from the smallest to the largest ratio."""
+    """Divides a by b, negative values counted as 0; the interval goes from the smallest to the largest ratio.
+
+    What is positive divided by 0 is infinite, 0 divided by 0 anything from 0 to infinity.
+    """
     a, b = (Interval(*(max(each, 0.0) for each in given)) for given in (a, b))
-    value, high = (x / y if y > 0 else math.inf for x, y in ((a.value, b.value), (a.high, b.low)))
-    return Interval(value, a.low / b.high if b.high > 0 else 0.0, high)
+    value, low, high = (x / y if y > 0 else math.inf for x, y in ((a.value, b.value), (a.low, b.high), (a.high, b.low)))
+    return Interval(value, low if a.low > 0 else 0.0, high)
 
 
 def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) -> Interval | None:
@@ -140,6 +148,11 @@ def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) ->
     return Interval(float(value[0]), float(low), float(high))
 
 
+def _least(game: Game) -> float:
+    """Returns the score above random play from which on an agent has learned the game."""
+    return LEARNED * max(above_chance(score(runs), game.name).value for runs in game.runs.values())
+
+
 def _compare(
     measure: Callable[[Sequence[RunData]], Interval], what: str, pairs: Sequence[tuple[str, str]], game: Game
 ) -> list[Part | None]:
@@ -150,8 +163,10 @@ def _compare(
             parts.append(None)
             continue
         a, b = (measure(game.runs[name]) for name in pair)
-        found = over(above_chance(a, game.name), above_chance(b, game.name))
-        seen = f"{what}: `{pair[0]}` {a}, `{pair[1]}` {b}; ratio {found}"
+        above = above_chance(a, game.name), above_chance(b, game.name)
+        learned = max(each.value for each in above) >= _least(game)
+        found = over(*above) if learned else _ANYTHING
+        seen = f"{what}: `{pair[0]}` {a}, `{pair[1]}` {b}; {f'ratio {found}' if learned else 'neither has learned'}"
         parts.append(Part(found, min(len(game.runs[name]) for name in pair), seen))
     return parts
 
@@ -170,11 +185,16 @@ def _longer(slow: str, fast: str) -> Callable[[Game], list[Part | None]]:
         if slow not in game.runs or fast not in game.runs:
             return [None]
         groups = game.runs[slow], game.runs[fast]
+        seeds = min(map(len, groups))
+        for name, runs in zip((slow, fast), groups, strict=True):
+            last = Interval(*[float(np.mean([run.score[-1] for run in runs]))] * 3)
+            if above_chance(last, game.name).value < _least(game):
+                return [Part(_ANYTHING, seeds, f"`{name}` has not learned")]
         steps, hours = (times_longer(*groups, axis) for axis in ("env_steps", "time"))
         if steps is None or hours is None:
             return [None]
         seen = f"`{slow}` takes {steps} times the steps of `{fast}`, and {hours} times the core hours"
-        return [Part(steps, min(map(len, groups)), seen)]
+        return [Part(steps, seeds, seen)]
 
     return parts
 

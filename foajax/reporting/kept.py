@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from foajax.config.parse import refuse, replace, to_mapping
 from foajax.config.schema import Config
 from foajax.reporting.curves import RunData, read_run
 from foajax.reporting.markdown import table
+from foajax.runs.directory import FREE, compared, load_config
 from foajax.runs.rows import parse_row
 from foajax.runs.status import newest_checkpoint
 from foajax.sensors.registry import make_sensor
@@ -38,7 +39,7 @@ def keep(path: Path, name: str | None) -> Path:
         why = f"has {newest:,} of its {run.config.train.env_steps:,} env_steps"
         raise refuse("run", path, "a finished run, or one that is given fewer train.env_steps", why=why)
     episodes, watched = protocol(run.config)
-    wanted = {"env_steps": newest, "policy": "sampled", "episodes": episodes}
+    wanted = {"env_steps": newest, "policy": "sampled", "episodes": episodes, "protocol": []}
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
         command = f"foajax evaluate run={path} episodes={episodes} json={path}/score.json"
@@ -51,11 +52,10 @@ def keep(path: Path, name: str | None) -> Path:
     config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
     out = KEPT / game / (name or f"{config.name}-s{config.seed}")
-    text = yaml.safe_dump(to_mapping(config), sort_keys=False)
-    if out.exists() and (out / "config.yaml").read_text() != text:
+    if out.exists() and not _same(load_config(out), config):
         raise refuse("name", out.name, "another name=<name>-s<seed>", why="holds another run")
     out.mkdir(parents=True, exist_ok=True)
-    (out / "config.yaml").write_text(text)
+    (out / "config.yaml").write_text(yaml.safe_dump(to_mapping(config), sort_keys=False))
     lines = (path / "metrics.jsonl").read_bytes().splitlines()
     rows = [row for line in lines if (row := parse_row(line)) and row["env_steps"] <= newest]
     chosen = np.unique(np.linspace(0, len(rows) - 1, _ROWS).round().astype(int))
@@ -66,6 +66,12 @@ def keep(path: Path, name: str | None) -> Path:
     (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")
     (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
     return out
+
+
+def _same(first: Config, second: Config) -> bool:
+    a, b = compared(first), compared(second)
+    differing = {key for key in a | b if a.get(key) != b.get(key)}
+    return differing <= FREE - {"name", "train.env_steps"}
 
 
 def protocol(config: Config) -> tuple[int, bool]:
@@ -106,7 +112,6 @@ def row(run: RunData) -> list[str]:
     """Makes a run's row of the table."""
     facts, score = record(run), run.evaluation or {}
     values = make_sensor(run.config.sensor).count(run.config.env.frame_shape).nominal
-    digits = 1 if score["stderr"] >= 0.05 else 3  # a scene of search earns 1 at most
     return [
         run.config.game,
         f"`{run.config.name}`",
@@ -115,9 +120,15 @@ def row(run: RunData) -> list[str]:
         run.config.gaze.mode,
         f"{facts['env_steps'] / 1e6:.1f} M",
         f"{facts['hours']:.1f}",
-        f"{score['mean']:.{digits}f} ± {score['stderr']:.{digits}f}",
+        written(score),
         f"[{run.path.parent.name}/{run.path.name}]({run.path.parent.name}/{run.path.name})",
     ]
+
+
+def written(score: Mapping[str, Any]) -> str:
+    """Writes a score's mean and standard error."""
+    digits = 1 if score["stderr"] >= 0.05 else 3  # a scene of search earns 1 at most
+    return f"{score['mean']:.{digits}f} ± {score['stderr']:.{digits}f}"
 
 
 def write_table(runs: Sequence[RunData], directory: Path = KEPT) -> None:

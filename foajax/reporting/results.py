@@ -40,16 +40,19 @@ _AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")
 
 
 def by_game(runs: Sequence[RunData]) -> dict[str, Game]:
-    """Groups kept runs by game; their `time` becomes core seconds.
+    """Groups kept runs by game; their `time` becomes core seconds, at the mean speed of an experiment's seeds.
 
     Raises:
-      ConfigError: runs of a game that are compared differ in more than sensor, gaze and seed.
+      ConfigError: runs of a game that are compared differ in more than sensor, gaze and seed; a seed is there twice;
+        the gaze is another than a run's name says.
     """
     games = {}
     for name, groups in games_of(runs, None).items() if runs else ():
         if name not in GAMES:
             continue
-        labelled = {_label(seeds[0]): [_in_core_time(run) for run in seeds] for seeds in groups.values()}
+        labelled = {_label(seeds[0]): _in_core_time(seeds) for seeds in groups.values()}
+        for label, seeds in labelled.items():
+            _check_seeds(label, seeds)
         _check_protocol([labelled[each] for each in labelled if each in _COMPARED])
         heats = {label: list(filter(None, map(_heat, seeds))) for label, seeds in labelled.items()}
         games[name] = Game(name, labelled, heats)
@@ -63,12 +66,26 @@ def _label(run: RunData) -> str:
     return f"{name}, canvas" if is_canvas else name
 
 
-def _in_core_time(run: RunData) -> RunData:
-    return run._replace(time=run.time * kept.record(run)["cores"])
+def _in_core_time(seeds: Sequence[RunData]) -> list[RunData]:
+    mean = np.mean([run.time[-1] * kept.record(run)["cores"] for run in seeds])
+    return [run._replace(time=run.time / run.time[-1] * mean) for run in seeds]
 
 
 def _heat(run: RunData) -> heatmap.HeatMap | None:
     return heatmap.of_run(run.path, kept.record(run)["env_steps"])
+
+
+def _check_seeds(label: str, seeds: Sequence[RunData]) -> None:
+    _check_lengths(seeds)
+    paths: dict[int, Path] = {}
+    for run in seeds:
+        if run.config.seed in paths:
+            accepted = f"another seed than that of {paths[run.config.seed]}"
+            raise refuse(str(run.path), accepted=accepted, why="repeats it")
+        paths[run.config.seed] = run.path
+        mode = run.config.gaze.mode
+        if label in _COMPARED and mode not in ("learned", "none") and not label.endswith(f"-{mode}"):
+            raise refuse(str(run.path), accepted=f"name={run.config.name}-{mode}", why=f"has a {mode} gaze")
 
 
 def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
@@ -78,7 +95,11 @@ def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
             other = next(run for run, value in zip(first, values, strict=True) if value != values[0])
             accepted = f"the same {key} as in {first[0].path}"
             raise refuse(str(other.path), accepted=accepted, why="is compared with runs of another kind")
-    lengths = {run.config.train.env_steps: run for seeds in groups for run in seeds}
+    _check_lengths(first)
+
+
+def _check_lengths(runs: Sequence[RunData]) -> None:
+    lengths = {run.config.train.env_steps: run for run in runs}
     for steps, run in list(lengths.items())[1:]:
         accepted = f"{next(iter(lengths)):,}, as the runs that it is compared with"
         raise refuse(str(run.path), accepted=accepted, why=f"is of {steps:,} env_steps")
@@ -136,7 +157,7 @@ _PROTOCOL = """\
 - **Score**: 100 whole games of the final policy, with sampled actions.
 - **Curves**: each point is the mean of the last 100 games of training, with no other smoothing. 500 points of each
   curve are kept. With several seeds, thin lines are seeds, the thick line is their mean, and the band is the mean's
-  95 % interval by bootstrap over seeds.
+  95 % interval by bootstrap over seeds. Against core hours, all seeds of an experiment are drawn at their mean speed.
 
 [results/runs](../results/runs/README.md) has commands, commits and machines of all runs."""
 
@@ -148,8 +169,9 @@ def _protocol(games: Mapping[str, Game]) -> str:
         return ", ".join(sorted(set(values)))
 
     text = _PROTOCOL
-    for game in games.values():  # whose runs share one learner: see `_check_protocol`
-        if words := _unlike_default(next(iter(game.runs.values()))[0].config.learner):
+    for game in games.values():
+        learners = [game.runs[label][0].config.learner for label in game.runs if label in _COMPARED]
+        if learners and (words := _unlike_default(learners[0])):  # they share it: see `_check_protocol`
             text += f"\n\nOn {GAMES[game.name]} the learner was today's default with {', '.join(words)}."
     if facts:
         pythons, cpus = each(fact["python"] for fact in facts), each(fact["cpu"] for fact in facts)
@@ -209,7 +231,8 @@ def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
 
 _COLUMNS = ["agent", "pixel values", "seeds", "score", "of `nonfoa`", "MFLOP", "ms alone", "ms of 32", "core hours"]
 _SCORES = """\
-- **score**: mean of 100 games, in brackets its 95 % interval over seeds, or over the games where there is one seed.
+- **score**: mean of 100 games, in brackets its 95 % interval by bootstrap over seeds, or over the games where there
+  is one seed. With three seeds it goes from the worst to the best.
 - **of `nonfoa`**: ratio of the scores, each less that of random play.
 - **MFLOP, ms alone, ms of 32**: arithmetic of one decision, and its time on a CPU, alone and as one of 32 at once
   ([cost.json](../results/bench/cost.json)).
@@ -228,14 +251,14 @@ def _scores(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
 def _row(game: Game, label: str, costs: Sequence[Mapping[str, Any]]) -> list[str]:
     runs = game.runs[label]
     config = runs[0].config
-    of_whole = claims.over(_worth(game, label), _worth(game, "nonfoa")) if "nonfoa" in game.runs else None
+    comparable = "nonfoa" in game.runs and label in _COMPARED - {"nonfoa"}
     measured = (config.name.split("-")[0], config.network.torso)
     return [
         f"`{label}`",
         f"{make_sensor(config.sensor).count(config.env.frame_shape).nominal:,}",
         str(len(runs)),
         str(claims.score(runs)),
-        str(of_whole) if of_whole and label != "nonfoa" else "",
+        str(claims.over(_worth(game, label), _worth(game, "nonfoa"))) if comparable else "",
         *_cost(next((each for each in costs if (each["experiment"], each["torso"]) == measured), None)),
         f"{np.mean([run.time[-1] for run in runs]) / 3600:.1f}",
     ]
@@ -253,19 +276,19 @@ def _cost(record: Mapping[str, Any] | None) -> list[str]:
     return [f"{record['decision_flops'] / 1e6:.1f}", f"{alone:.2f}", f"{together:.2f}"]
 
 
-def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str | None:
-    """Makes the README's block: the whole frame and several gazes on Breakout; None before the first three were run."""
+def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
+    """Makes the README's block: the whole frame and several gazes on Breakout, once the first three were run."""
     game = games.get("breakout", Game("breakout", {}))
     there = [label for label in _GAZES if label in game.runs]
     if there[:3] != list(_GAZES)[:3]:
-        return None
+        return "Not run yet.\n"
     rows = []
     for label in there:
         name = game.runs[label][0].config.name  # as it is typed, with `_packed`
         rows.append([f"{_GAZES[label]} (`{name}`)", *_row(game, label, costs)[1:5]])
     whole, learned, frozen = (_worth(game, label).value for label in list(_GAZES)[:3])
     one = any(len(game.runs[label]) == 1 for label in there)
-    over_what = "over seeds; where there is one seed, over its games" if one else "over seeds"
+    over_what = f"over seeds{'; where there is one seed, over its games' if one else ', from the worst to the best'}"
     verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
     found = [verdict for verdict in dict.fromkeys(verdicts) if verdict != claims.NOT_RUN] + [claims.NOT_RUN]
     counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in found if verdict in verdicts)
@@ -315,6 +338,5 @@ def write(runs: Sequence[RunData], root: Path = ROOT) -> None:
     draw(games, root / "docs" / "results")
     (root / "docs" / "results.md").write_text(page(games, costs))
     readme = root / "README.md"
-    if text := block(games, costs):
-        readme.write_text(fill(readme.read_text(), text))
+    readme.write_text(fill(readme.read_text(), block(games, costs)))
     search.write(runs, root / "docs")

@@ -35,7 +35,7 @@ class Interval(NamedTuple):
 
     def __str__(self) -> str:
         """Writes three digits or, from 1,000 on, whole numbers."""
-        value, low, high = (f"{each:,.0f}" if 1000 <= abs(each) < math.inf else f"{each:.3g}" for each in self)
+        value, low, high = (f"{each:,.0f}" if 999.5 <= abs(each) < math.inf else f"{each:.3g}" for each in self)
         return f"{value} [{low}, {high}]" if low != high else value
 
 

@@ -12,7 +12,8 @@ import pytest
 from foajax import cli, keep
 from foajax.config.compose import compose
 from foajax.config.parse import ConfigError, flatten, to_mapping
-from foajax.reporting import kept
+from foajax.reporting import kept, results
+from foajax.reporting.curves import read_run
 from foajax.runs.directory import FREE, load_config
 from foajax.viewing import heatmap
 from foajax.viewing.heatmap import HeatMap
@@ -60,6 +61,7 @@ def run(tmp_path, monkeypatch):
         "env_steps": 2000,
         "policy": "sampled",
         "episodes": 100,
+        "protocol": [],
         "mean": 9.0,
         "stderr": 0.5,
         "returns": [9.0] * 100,
@@ -115,6 +117,30 @@ def test_a_score_of_fewer_games_is_refused(run):
     (run / "score.json").write_text(json.dumps(score | {"episodes": 30}))
     with pytest.raises(ConfigError, match="score.json has .*30.*accepted is what foajax evaluate .*episodes=100"):
         kept.keep(run, None)
+    (run / "score.json").write_text(json.dumps(score | {"protocol": ["env.sticky_actions=0.25"]}))
+    with pytest.raises(ConfigError, match="score.json has .*sticky"):
+        kept.keep(run, None)
     (run / "score.json").unlink()
     with pytest.raises(ConfigError, match="has no score.json; accepted is what foajax evaluate"):
         kept.keep(run, None)
+
+
+def test_a_run_may_be_kept_again_but_not_over_another(run):
+    out = kept.keep(run, None)
+    (out / "config.yaml").write_text("# as an older schema wrote it\n" + (out / "config.yaml").read_text())
+    assert kept.keep(run, None) == out
+    text = (out / "config.yaml").read_text()
+    (out / "config.yaml").write_text(text.replace("env_steps: 2000", "env_steps: 1000"))
+    with pytest.raises(ConfigError, match="seek-s3: holds another run; accepted is another name"):
+        kept.keep(run, None)
+
+
+def test_a_run_that_the_page_refuses_is_not_kept(run, monkeypatch, capsys):
+    kept.KEPT.mkdir()
+    first = kept.keep(run, "zebra")
+    monkeypatch.setattr(kept, "runs", lambda: [read_run(path) for path in sorted(kept.KEPT.glob("*/*"))])
+    monkeypatch.setattr(results, "GAMES", {"seek": "Seek"})
+    assert cli.run(keep.keep, [f"run={run}"]) == 2
+    error = capsys.readouterr().err
+    assert f"{kept.KEPT}/seek/seek-s3: repeats it; accepted is another seed than that of {first}" in error
+    assert kept.runs()[0].path == first and len(kept.runs()) == 1

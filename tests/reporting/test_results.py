@@ -125,6 +125,32 @@ def test_seeds_that_overlap_cannot_tell():
     assert finding.seen[0].startswith("Score: `constant50_sub1` 100 [99.8, 101], ")
 
 
+PONG = {"nonfoa": 19, "decreasing": -10}  # -20.7 is random play
+
+
+@pytest.mark.parametrize(
+    ("others", "verdict"),
+    [
+        ({"constant50_sub1": -20.9}, "holds"),  # it has an infinite ratio to one that is no better than random play
+        ({"constant50_sub1": -20.7}, "holds"),
+        ({"constant50_sub1": 5}, "does not hold"),
+        ({"constant50_sub1": -20.5, "decreasing": -20.2}, "cannot tell"),  # neither has learned
+        ({"constant50_sub1": -21, "decreasing": -21}, "cannot tell"),
+    ],
+)
+def test_who_has_not_learned_a_game_cannot_tell(others, verdict):
+    game = Game("pong", {name: [run_of(mean, seed=i) for i in range(3)] for name, mean in (PONG | others).items()})
+    finding = ask(next(claim for claim in CLAIMS if claim.title == "The outer ring helps"), game)
+    assert finding.verdict == verdict
+    assert finding.seen[0].endswith("; neither has learned") == (verdict == "cannot tell")
+
+
+def test_how_much_longer_is_not_asked_of_who_has_not_learned():
+    game = Game("pong", {"nonfoa": seeds_of(19), "constant70_p": seeds_of(-20.6)})
+    finding = ask(next(claim for claim in CLAIMS if claim.title == "Learning takes about 5 times longer"), game)
+    assert finding == ("cannot tell", ["`constant70_p` has not learned"])
+
+
 def test_an_interval_is_that_of_an_independent_bootstrap():
     run = run_of(100)
     returns, drawn = np.array(run.evaluation["returns"]), np.random.default_rng(7)
@@ -139,6 +165,8 @@ def test_an_interval_is_that_of_an_independent_bootstrap():
 def test_a_ratio_goes_from_the_smallest_to_the_largest():
     assert claims.over(Interval(6, 4, 8), Interval(3, 2, 4)) == (2, 1, 4)
     assert claims.over(Interval(1, -1, 2), Interval(0, -1, 1)) == (np.inf, 0, np.inf)  # no better than random play
+    assert claims.over(Interval(3, 2, 4), Interval(0, -1, 1)) == (np.inf, 2, np.inf)
+    assert claims.over(Interval(3, 2, 4), Interval(-2, -3, -1)) == (np.inf, np.inf, np.inf)
 
 
 def test_times_longer_is_read_where_both_have_the_lower_score():
@@ -220,14 +248,45 @@ def test_the_readme_names_the_best_gaze_once_all_sensors_were_run(checkout):
     assert "`constant50_sub2` scores best: 0.92 of the whole frame, from 625 values." in block  # 108.3 of 118.3
 
 
-def test_without_runs_the_readme_stays(checkout):
-    assert "not run yet" in results.page({}, []) and results.block({}, []) is None
+def test_without_runs_the_readme_says_so():
+    assert "not run yet" in results.page({}, []) and results.block({}, []) == "Not run yet.\n"
 
 
 def test_runs_of_another_kind_are_not_compared(checkout):
     keep_run(checkout / "results/runs", ["game=breakout", "experiment=decreasing_packed", "learner.num_epochs=3"], 50)
     with pytest.raises(ConfigError, match="decreasing_packed-s0.*the same learner.num_epochs as in"):
         results.by_game(kept.runs(checkout / "results/runs"))
+
+
+def test_a_run_that_is_not_compared_has_no_ratio_and_no_word_on_the_learner(checkout):
+    words = ["game=breakout", "experiment=constant70", "learner.num_epochs=3", "name=aaa"]
+    keep_run(checkout / "results/runs", words, 50, steps=9_000_000)
+    page = results.page(results.by_game(kept.runs(checkout / "results/runs")), [])
+    assert "On Breakout the learner" not in page
+    cells = next(line for line in page.splitlines() if line.startswith("| `aaa, canvas`")).split("|")
+    assert cells[4].startswith(" 50") and not cells[5].strip()
+
+
+@pytest.mark.parametrize(
+    ("words", "seed", "message"),
+    [
+        (["name=constant70_p_packed"], 0, "is of 1,000 env_steps; accepted is 3,000,000"),
+        (["gaze=random", "name=decreasing_packed"], 0, "has a random gaze; accepted is name=decreasing_packed-random"),
+    ],
+)
+def test_seeds_of_one_name_are_of_one_kind(checkout, words, seed, message):
+    runs = checkout / "results/runs"
+    keep_run(runs, ["game=breakout", "experiment=constant70_p_packed", *words], 50, seed=seed + 1, steps=1000)
+    with pytest.raises(ConfigError, match=message):
+        results.by_game(kept.runs(runs))
+
+
+def test_core_hours_are_those_of_the_mean_speed(checkout):
+    path = keep_run(checkout / "results/runs", ["game=breakout", "experiment=nonfoa"], 120, seed=1)
+    facts = json.loads((path / "run.json").read_text())
+    (path / "run.json").write_text(json.dumps(facts | {"cores": 6}))
+    seeds = results.by_game(kept.runs(checkout / "results/runs"))["breakout"].runs["nonfoa"]
+    assert [run.time[-1] for run in seeds] == pytest.approx([4 * STEPS[-1] / 700] * 2)
 
 
 def test_the_page_says_where_the_learner_was_not_todays(checkout):
@@ -248,4 +307,4 @@ def test_the_page_in_the_repository_is_what_its_runs_say():
     costs = json.loads((results.ROOT / "results/bench/cost.json").read_text())["results"]
     assert (results.ROOT / "docs/results.md").read_text() == results.page(games, costs)
     text, readme = results.block(games, costs), (results.ROOT / "README.md").read_text()
-    assert text is None or fill(readme, text) == readme
+    assert fill(readme, text) == readme
