@@ -61,7 +61,7 @@ def reproduce(arguments: Sequence[str]) -> int:
     ]
     if options.show == "table":
         return _show(planned)
-    failed = 0
+    failed, stop = 0, sweep.Stop()
     for about, runs in planned:
         if options.show == "commands":
             for run in runs:
@@ -69,7 +69,10 @@ def reproduce(arguments: Sequence[str]) -> int:
                     print(f"python -m foajax.train {' '.join(run.words)}")
             continue
         print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
-        failed |= sweep.run_all(runs, jobs=options.jobs) | _play(runs, options.jobs)
+        failed |= sweep.run_all(runs, jobs=options.jobs, stop=stop)
+        if stop.requested:
+            break
+        failed |= _play(runs, options.jobs)
     return failed
 
 

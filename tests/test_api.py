@@ -30,6 +30,19 @@ def test_sense_is_compiled_once_for_a_sensor_and_a_shape():
     assert whole.shape == (40, 50, 3)
 
 
+def test_a_closed_terminal_is_heard_of_unless_it_is_ignored():
+    former = signal.getsignal(signal.SIGHUP)
+    try:
+        for handler, ends in ((signal.SIG_DFL, "SIGHUP"), (signal.SIG_IGN, None)):  # the second as under nohup
+            signal.signal(signal.SIGHUP, handler)
+            with StopRequest() as stop:
+                signal.raise_signal(signal.SIGHUP)
+                assert stop.name == ends
+            assert signal.getsignal(signal.SIGHUP) == handler
+    finally:
+        signal.signal(signal.SIGHUP, former)
+
+
 def test_another_thread_asks_for_no_signals_and_the_main_one_gives_them_back():
     former, found = [signal.getsignal(number) for number in STOPS], []
 

@@ -6,9 +6,11 @@ import json
 import shlex
 
 import pytest
+import yaml
 
 from foajax import cli, reproduce
 from foajax.config.compose import compose
+from foajax.config.parse import to_mapping
 from foajax.launch import sweep
 
 SENSORS = {
@@ -70,3 +72,38 @@ def test_a_stage_is_trained_evaluated_and_then_left_alone(short, capsys):
 def test_what_cannot_be_is_refused(capsys, word, said):
     assert cli.run(reproduce.reproduce, [word]) == 2
     assert capsys.readouterr().err.startswith(f"foajax: error: {said}")
+
+
+def test_a_request_to_stop_ends_it_before_the_next_stage(monkeypatch, capsys):
+    def stopped(runs, *, jobs, stop):
+        started.append(runs)
+        stop.requested = 2
+        return 0
+
+    started = []
+    monkeypatch.setattr(sweep, "run_all", stopped)
+    monkeypatch.setattr(reproduce, "_play", None)
+    assert cli.run(reproduce.reproduce, []) == 0
+    assert len(started) == 1
+
+
+def test_the_table_tells_a_planned_run_from_another(short, capsys):
+    """Of one that is shorter than planned, one of another learner, one whose score is older than its checkpoint."""
+    for seed, words, steps in ((0, [], 320), (1, ["learner.learning_rate=1e-5"], 640)):
+        line = f"experiment=seek seed={seed} train.env_steps={steps} env.num_envs=4 train.log_every=0.1"
+        config = compose([*line.split(), *words])
+        path = short / config.run_dir
+        (path / "checkpoints" / str(steps)).mkdir(parents=True)
+        (path / "config.yaml").write_text(yaml.safe_dump(to_mapping(config)))
+        (path / "run.json").write_text('{"starts": []}')
+        (path / "score.json").write_text(json.dumps({"env_steps": 320, "mean": 1148.4, "stderr": 31.0}))
+    assert cli.run(reproduce.reproduce, ["show=table"]) == 0
+    shorter, other = (line for line in capsys.readouterr().out.splitlines() if "runs/seek" in line)
+    assert "too short" in shorter and "1148.4 ± 31.0" in shorter
+    assert "another run" in other and "1148" not in other
+
+
+def test_commands_have_no_empty_lines(monkeypatch, capsys):
+    monkeypatch.setattr(reproduce, "is_finished", lambda config: True)
+    assert cli.run(reproduce.reproduce, ["show=commands"]) == 0
+    assert capsys.readouterr().out == ""

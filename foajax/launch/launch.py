@@ -16,7 +16,8 @@ from foajax.config.schema import RENAMED, Config
 from foajax.config.shipped import experiments
 from foajax.launch import sweep
 from foajax.launch.signals import interrupt_ends
-from foajax.runs.directory import is_run
+from foajax.runs.directory import failure, is_run, note_failure
+from foajax.runs.lock import is_held
 from foajax.runs.status import is_finished
 
 Task = Callable[[Config], int | None]  # returns an exit code, None for 0
@@ -159,14 +160,17 @@ def _job(task: Task, swept: Mapping[str, str] | None, failures: dict[str, str], 
     try:
         code = cli.run(lambda _: task(config), ())
     except Exception as error:  # whatever it is, the next run starts
-        failures[config.run_dir] = "exit 1"
+        code = 1
         sys.excepthook(type(error), error, error.__traceback__)
-        return
     in_this_process = HydraConfig.get().launcher["_target_"].endswith("BasicLauncher")
     if code == cli.INTERRUPTED or (in_this_process and not code and _is_left(config)):
         raise SystemExit(code)  # it was asked to stop, and so were the runs after it
     if code:
         failures[config.run_dir] = f"exit {code}"
+        path = Path(config.run_dir)
+        if not in_this_process and failure(path) is None and not is_held(path):  # the dict is a copy there
+            path.mkdir(parents=True, exist_ok=True)
+            note_failure(path, f"exit {code}")
 
 
 def _is_left(config: Config) -> bool:

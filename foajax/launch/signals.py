@@ -5,17 +5,24 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)  # the last one is a cluster's preemption
+# SIGUSR1 is a cluster's preemption, SIGHUP a terminal that is closed.
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
 def signal_in(numbers: bytes) -> str:
     """Returns the name of the first request to stop among numbers of signals, or an empty text."""
     names = [signal.Signals(number).name for number in numbers if number in STOPS]
     return names[0] if names else ""
+
+
+def handle_stops(handler: Callable[[int, FrameType | None], None]) -> dict[int, Any]:
+    """Has `handler` called for requests to stop; returns the former handlers. Under nohup, SIGHUP stays ignored."""
+    heard = [number for number in STOPS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+    return {number: signal.signal(number, handler) for number in heard}
 
 
 def arrive_here() -> bool:
@@ -42,7 +49,7 @@ def interrupt_ends() -> Iterator[None]:
 
 
 class StopRequest:
-    """Turns SIGINT, SIGTERM and SIGUSR1 (a cluster's preemption) into a flag; a second SIGINT interrupts at once.
+    """Turns the signals of `STOPS` into a flag; a second SIGINT interrupts at once.
 
     Outside the main thread it hears of no signal. After its `with`, the former handlers are back.
     """
@@ -53,7 +60,7 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if arrive_here():
-            self._former = {number: signal.signal(number, self._note) for number in STOPS}
+            self._former = handle_stops(self._note)
         return self
 
     def __exit__(self, *_: object) -> None:

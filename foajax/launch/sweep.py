@@ -20,10 +20,11 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
+from foajax import cli
 from foajax.config.compose import choices, compose, parse_override
 from foajax.config.parse import one_line, refuse, replace
 from foajax.config.schema import RENAMED, Config
-from foajax.launch.signals import STOPS
+from foajax.launch.signals import STOPS, handle_stops
 from foajax.runs.directory import failure, forget_failure
 from foajax.runs.status import is_finished
 
@@ -39,8 +40,8 @@ class PlannedRun(NamedTuple):
     config: Config
 
 
-class _Stop:
-    """Passes signals on to the running processes and remembers that there was one."""
+class Stop:
+    """Passes requests to stop on to the running processes and remembers that there was one."""
 
     def __init__(self) -> None:
         self.requested: int | None = None  # the signal
@@ -54,7 +55,7 @@ class _Stop:
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
-        before = {number: signal.signal(number, self._pass_on) for number in STOPS}
+        before = handle_stops(self._pass_on)
         try:
             yield
         finally:
@@ -68,17 +69,19 @@ class _Stop:
                 process.send_signal(number)
 
 
-def run_all(runs: Sequence[PlannedRun], *, jobs: int, command: Sequence[str] = COMMAND) -> int:
+def run_all(
+    runs: Sequence[PlannedRun], *, jobs: int, command: Sequence[str] = COMMAND, stop: Stop | None = None
+) -> int:
     """Runs `command` with each run's words, `jobs` at a time; returns 1 if one failed, else 0.
 
     With `jobs=1` a run has the terminal and all cores. Else it writes to `output.txt` in its directory and has its
-    share of the cores.
+    share of the cores. Afterwards `stop` tells whether it was asked to stop.
     """
     waiting = deque(run for run in runs if not skip_if_finished(run.config))
     failures: dict[str, str] = {}
     shares = deque(shares_of_cores(min(jobs, len(waiting) or 1)))  # so that few runs leave no core idle
     taken: dict[str, set[int]] = {}  # by run directory
-    stop = _Stop()
+    stop = stop or Stop()
     with stop.listening():
         while stop.processes or (waiting and not stop.requested):
             while waiting and len(stop.processes) < jobs and not stop.requested:
@@ -98,7 +101,7 @@ def run_all(runs: Sequence[PlannedRun], *, jobs: int, command: Sequence[str] = C
                     del stop.processes[directory]
                     shares.append(taken.pop(directory))
                     # A run that was stopped before it could save has not failed.
-                    if code and not (stop.requested and -code in STOPS):
+                    if code and not (stop.requested and (-code in STOPS or code == cli.INTERRUPTED)):
                         ended = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit {code}"
                         failures[directory] = ended if jobs == 1 else f"{ended} (see {_OUTPUT} there)"
     return summarise([run.config for run in runs], failures)

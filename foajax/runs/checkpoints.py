@@ -94,6 +94,10 @@ class Checkpoints:
             raise CheckpointError(f"{self.directory} cannot be read: {error.strerror}") from error
         return sorted(int(name) for name in names if _COMPLETE.fullmatch(name))
 
+    def has(self, env_steps: int) -> bool:
+        """Whether there is a complete checkpoint of `env_steps`, and it has not failed to restore."""
+        return env_steps not in self._unusable and os.path.isdir(self.directory / str(env_steps))
+
     def save(self, env_steps: int, state: Any, meta: Mapping[str, Any]) -> bool:
         """Starts writing a checkpoint in the background and returns.
 
@@ -193,7 +197,7 @@ class Checkpoints:
 
     def _write(self, env_steps: int, new: Path, arrays: dict[str, Any], text: str) -> None:
         final = self.directory / str(env_steps)
-        if final.exists() and env_steps not in self._unusable:
+        if self.has(env_steps):
             return
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir(parents=True)

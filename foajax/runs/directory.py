@@ -194,6 +194,8 @@ def _settle_config(path: Path, config: Config) -> None:
         check_same_run(path, config)
         if file.read_text(encoding="utf-8") == text:
             return
+    elif _has_begun(path):
+        raise refuse_run(path, f"has rows or checkpoints but no {_CONFIG}", "another directory, or that file again")
     durable.replace(file, text.encode())
 
 
@@ -211,8 +213,8 @@ def check_same_run(path: Path, config: Config) -> None:
     if keys:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
         still = FREE if stored["learner.schedule"] == "constant" else ()
-        words = shlex.join(f"{key}={_show(stored[key])}" for key in keys if key in stored and key not in still)
-        remedy = f"choose another run=<dir>, or go on with {words}"
+        words = shlex.join(_word(key, stored[key]) for key in keys if key in stored and key not in still)
+        remedy = f"choose another run=<dir>, or {f'go on with {words}' if words else f'leave out {keys[0]}'}"
         if keys[0] == "train.env_steps":
             remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
         raise refuse(keys[0], new, "", why=f"the run in {path} has {old}; {remedy}", kind=RunError)
@@ -222,6 +224,12 @@ def _has_begun(path: Path) -> bool:
     """Whether the run has a row of metrics or a checkpoint."""
     rows, checkpoints = path / "metrics.jsonl", path / "checkpoints"
     return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
+
+
+def _word(key: str, value: Any) -> str:
+    """Writes a key and its value as one types them. `sensor=rings` brings the keys of its kind, `sensor.kind` none."""
+    is_group = key == "sensor.kind" and ":" not in value
+    return f"{'sensor' if is_group else key}={_show(value)}"
 
 
 def _show(value: Any) -> str:

@@ -100,6 +100,10 @@ class Logger:
         """Prints a line on the terminal; may be called from any thread."""
         self._display.message(text)
 
+    def leave_terminal(self) -> None:
+        """Ends what is drawn in place on the terminal."""
+        self._display.close()
+
     def close(self) -> None:
         """Closes the display and the files."""
         for output, close in (("metrics.jsonl", self._metrics.close), ("tensorboard", self._events.close)):
@@ -108,7 +112,7 @@ class Logger:
         if self._other is not None:
             with self._survive(_OTHER):
                 self._other.close()
-        self._display.close()
+        self.leave_terminal()
 
     def __enter__(self) -> Logger:
         return self

@@ -78,6 +78,11 @@ class Journal:
             for tag, image in snapshots(rollout, frame_shape).items():
                 self._logger.image(tag, image)
 
+    def leave_terminal(self) -> None:
+        """Gives back the terminal's cursor, before a process ends that closes nothing."""
+        if self._logger is not None:
+            self._logger.leave_terminal()
+
 
 def check_finite(metrics: Sequence[Metrics], max_skipped: int, env_steps: int) -> None:
     """Raises `ConfigError` if the updates of a run were not finite `max_skipped` times in a row."""

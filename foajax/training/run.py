@@ -53,9 +53,9 @@ class Run:
         self._agent = Agent(config, environments[0].num_actions, environments[0].crop_top)
         self._programs = make_programs(self._agent, self._layout)
         self._collector = Collector(self._agent, self._programs, environments, seed=config.seed, part=job.index)
-        self.progress.state = self._first_state()
         self._watch = PeerWatch(job, config.distributed.timeout, self._saving.rescue)
         with self._watch.expecting_others():
+            self.progress.state = self._first_state()
             self._saving.restore(self.progress, self._collector)
         is_new = not self.progress.env_steps and config.train.init_from is None
         self._to_observe = ROLLOUTS_TO_OBSERVE if is_new else 0
@@ -128,9 +128,9 @@ class Run:
                 self._saving.refresh_copy(at)
             own, outcomes = self._collector.collect(self._nearby(at.state), self._step())
             outcomes, games = self._exchange(outcomes, stop)
-            self._track(outcomes)
             # Fetched one rollout late: by now they are there, and nothing waits for the device.
             self._check(metrics)
+            self._track(outcomes)
             now = time.monotonic()
             if metrics and now - logged >= config.train.log_every:
                 self._log(metrics)
@@ -218,6 +218,7 @@ class Run:
         else:
             why, code = self._unsaved(), 2
             self._journal.say(f"foajax: error: {why}")
+        self._journal.leave_terminal()
         if self._saving.checkpoints is not None:
             note_failure(Path(self._config.run_dir), why)
         return code

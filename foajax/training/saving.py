@@ -59,7 +59,7 @@ class Saving:
 
     def is_saved(self, progress: Progress) -> bool:
         """Whether nothing is left to save."""
-        return self.checkpoints is None or progress.env_steps in (0, *self.checkpoints.steps())
+        return self.checkpoints is None or not progress.env_steps or self.checkpoints.has(progress.env_steps)
 
     def save(self, progress: Progress) -> None:
         """Starts to write a checkpoint, and does not wait for it."""

@@ -152,10 +152,12 @@ class Watchdog:
                 return
             try:
                 code = self._abandon(why, code)
-            finally:
-                with contextlib.suppress(OSError, ValueError):
-                    sys.stdout.flush()
-                os._exit(code)
+            except BaseException:  # whatever it is, nothing else would end this process, or say so
+                traceback.print_exc()
+                code = code or 1
+            with contextlib.suppress(OSError, ValueError):
+                sys.stdout.flush()
+            os._exit(code)
 
 
 def record(run_dir: Path, error: BaseException | None) -> Path:

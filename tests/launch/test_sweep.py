@@ -24,8 +24,8 @@ directory.mkdir(exist_ok=True)
 times = directory / "times"
 times.write_text(str(time.time()))
 (directory / "cores").write_text(",".join(map(str, sorted(os.sched_getaffinity(0)))))
-if what == "wait":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+if what in ("wait", "interrupt"):
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(130 if what == "interrupt" else 0))
     (directory / "ready").touch()
     time.sleep(60)
 time.sleep(1)  # longer than a start takes beside another
@@ -148,8 +148,9 @@ def test_a_run_of_another_meaning_is_not_taken_for_finished(make, tmp_path):
     assert not sweep.skip_if_finished(other) and sweep.skip_if_finished(run.config)
 
 
-def test_a_signal_goes_on_to_the_running_and_nothing_else_starts(make, tmp_path, capfd):
-    runs = [make("a", "wait"), make("b", "finish")]
+@pytest.mark.parametrize("what", ["wait", "interrupt"])
+def test_a_signal_goes_on_to_the_running_and_nothing_else_starts(make, tmp_path, capfd, what):
+    runs, stop = [make("a", what), make("b", "finish")], sweep.Stop()
 
     def interrupt():
         while not (tmp_path / "a" / "ready").exists():
@@ -159,7 +160,8 @@ def test_a_signal_goes_on_to_the_running_and_nothing_else_starts(make, tmp_path,
     thread = threading.Thread(target=interrupt)
     thread.start()
     begin = time.monotonic()
-    assert sweep.run_all(runs, jobs=1, command=COMMAND) == 0
+    assert sweep.run_all(runs, jobs=1, command=COMMAND, stop=stop) == 0
+    assert stop.requested == signal.SIGTERM
     thread.join()
     assert time.monotonic() - begin < 20
     assert not (tmp_path / "b" / "times").exists()
@@ -221,6 +223,9 @@ def test_submitit_starts_each_run_in_a_job_of_its_own(tmp_path):
         code, _, err = train(tmp_path / "sweep", "--multirun", *launcher, *words)
         assert code == 0, err
         assert "sweep of 2 runs: 2 finished, 0 unfinished, 0 failed" in err
+    lost = ["experiment=nonfoa", "train.devices=1,64", *TINY, "gaze=learned", "train.env_steps=1000"]
+    code, _, err = train(tmp_path / "sweep", "--multirun", *launcher, *lost)
+    assert code == 1 and "1 finished, 0 unfinished, 1 failed" in err and "train.devices=64-s0: exit 2" in err
     for rate in ("0.001", "0.0001"):
         run = tmp_path / "sweep" / "runs" / f"seek-nonfoa-learner.learning_rate={rate}-s0"
         assert load_agent(run).env_steps == 1000

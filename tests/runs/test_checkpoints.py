@@ -314,7 +314,9 @@ def test_a_damaged_newest_is_reported_and_the_one_before_used(opened, told):
             f"checkpoint {directory}/3 cannot be used: meta.json does not match its checksum; using 2 instead"
         ]
         # Training comes to the same point again: the damaged one makes room and is not lost.
+        assert checkpoints.has(2) and not checkpoints.has(3) and not checkpoints.has(4)
         fill(checkpoints, 3)
+        assert checkpoints.has(3)
     assert sorted(os.listdir(directory)) == ["1", "2", "3", "3.unusable"]
     assert_same(opened().restore(small(0)).state, small(3))
     assert len(told) == 1

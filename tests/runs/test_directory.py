@@ -213,10 +213,23 @@ def test_another_meaning_is_refused_by_name(config, key, value, line):
     told = refusal(changed(config, **{key: value}))
     changes, _, words = told.partition("choose another run=<dir>, or go on with ")
     assert changes == line.format(run=config.run_dir)
-    name, _, _ = line.partition("=")
+    name = "sensor" if key == "sensor" else line.partition("=")[0]  # the group, which brings all keys of a kind
     assert f"{name}={re.search(r'has (.*); ', changes)[1]}" in shlex.split(words)
     assert {p.name: p.read_bytes() for p in Path(config.run_dir).iterdir()} == before
     open_run(config, command=COMMAND).close()  # and nobody holds it
+
+
+def test_a_key_that_the_run_has_not_is_to_be_left_out(config):
+    begun(config)
+    told = refusal(changed(config, network__torso_kwargs={"b": 2}))
+    assert told.startswith("network.torso_kwargs.b=2: the run in ")
+    assert told.endswith("has null; choose another run=<dir>, or leave out network.torso_kwargs.b")
+
+
+def test_a_run_without_its_configuration_is_not_gone_on_with(config):
+    begun(config)
+    (Path(config.run_dir) / "config.yaml").unlink()
+    assert "has rows or checkpoints but no config.yaml; accepted is another directory" in refusal(config)
 
 
 def test_what_means_the_same_is_taken_over(config):

@@ -95,6 +95,15 @@ def test_a_request_to_stop_is_answered_by_whoever_can(body, saved, ended):
     assert out == ("heard\nabandoned: SIGTERM (0)\n" if ended else "heard\nalive\n")
 
 
+def test_what_cannot_be_saved_does_not_end_as_if_it_were():
+    deaf = "signal.signal(signal.SIGTERM, lambda *_: None); __import__('sys').stdout.close()"
+    process = script(f"{deaf}; sleep(1000)", timeout=1000.0)
+    time.sleep(1)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=20)
+    assert process.returncode == 1  # as `tell` raises
+
+
 def test_one_of_several_processes_leaves_a_request_to_stop_to_all_of_them():
     """Also where there is nothing to lose here, and where the next call of an environment comes late."""
     process = script("time.sleep(3); sleep(0.1)", saved=True, alone=False)
