@@ -16,7 +16,7 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import ConfigError, Section, refuse, replace
-from foajax.config.schema import Config
+from foajax.config.schema import Config, game_name
 from foajax.config.shipped import agents
 from foajax.runs.agents import load_agent, load_score
 from foajax.runs.directory import load_config
@@ -69,9 +69,10 @@ def choose(directory: Path, game: str | None) -> Path:
 def demo(arguments: Sequence[str]) -> None:
     """Plays a game; prints the score, the page's address and what to look at."""
     options = cli.parse(Options, arguments)
-    path = Path(options.agent) if options.agent else choose(agents(), options.game)
+    game = options.game and game_name(options.game)
+    path = Path(options.agent) if options.agent else choose(agents(), game)
     stored, directory = load_agent(path, trust=options.trust, key="agent"), cli.make_directory(options.out)
-    if options.game not in (None, stored.agent.config.game):
+    if game not in (None, stored.agent.config.game):
         raise refuse("game", options.game, f"null or {stored.agent.config.game}", why=f"agent={path} plays another")
     use_compilation_cache()
     config = stored.agent.config

@@ -34,6 +34,12 @@ def test_the_best_agent_of_a_game_is_taken(shipped):
     assert demo.choose(shipped, "pong").name == "untold"
 
 
+@pytest.mark.parametrize("name", ["Breakout", "ALE/Breakout-v5"])
+def test_a_game_may_have_its_name_in_gymnasium(shipped, name, tmp_path, capsys):
+    assert cli.run(demo.demo, ["steps=2", f"game={name}", f"out={tmp_path / 'out'}"]) == 0
+    assert capsys.readouterr().out.startswith("good plays breakout.")
+
+
 def test_one_that_moves_its_gaze_comes_first(shipped, breakout_agent):
     config = shipped / "good" / "config.yaml"
     config.write_text(config.read_text().replace("mode: learned", "mode: frozen"))

@@ -61,6 +61,16 @@ def test_the_player(recording, tmp_path):
         page.screenshot(path=ARTEFACTS / "player.png")
 
 
+@browser_needed
+@pytest.mark.parametrize(("width", "parts"), [(3, 1), (80, 0)])
+def test_an_image_is_left_out_only_if_it_has_the_frames_shape(width, parts, recording, tmp_path):
+    config = compose([f"sensor.rings=[[80,{width},1]]", "sensor.layout=packed", "gaze.bounds=point"])
+    image = np.ones((len(recording.screens), 80, width), np.uint8)
+    page_file = player_page.write_page(recording._replace(config=config, images=(image,)), tmp_path)
+    with opened(page_file) as page:
+        assert page.locator("#parts canvas").count() == parts
+
+
 @pytest.mark.slow
 @browser_needed
 def test_the_player_shows_colours(untrained, tmp_path):

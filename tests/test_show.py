@@ -11,6 +11,7 @@ from foajax.config.compose import compose
 from foajax.config.schema import LogPolarSensor, RingSensor
 from foajax.sensors.registry import make_sensor
 from foajax.viewing import sheet
+from foajax.viewing.style import draw_gaze
 
 CANVAS = make_sensor(RingSensor(rings=((20, 20, 2), (40, 40, 4))))
 PACKED = make_sensor(RingSensor(rings=((20, 20, 2), (40, 40, 4)), peripheral=(5, 5), layout="packed"))
@@ -41,6 +42,13 @@ def test_the_rings_are_drawn_where_the_areas_end():
         rows, columns = np.nonzero((image == colour).all(axis=-1))
         assert (rows.min(), columns.min()) == (3 * top, 3 * left)
         assert (rows.max(), columns.max()) == (3 * (top + side) - 1, 3 * (left + side) - 1)
+
+
+@pytest.mark.parametrize("sensor", [RingSensor(rings=((1, 1, 1), (40, 40, 4))), LogPolarSensor(fovea=0.4, radius=0.5)])
+def test_an_area_smaller_than_a_pixel_of_the_picture_is_drawn(sensor):
+    image = Image.new("RGB", (20, 20))
+    draw_gaze(image, make_sensor(sensor), (41, 41), scale=(0.2, 0.2))
+    assert image.getbbox()
 
 
 def test_a_retina_is_drawn_as_a_circle():

@@ -49,7 +49,8 @@ def summarise(facts: Facts) -> dict[str, float]:
     - `fixations_present_8`, `fixations_absent_8`: of the episodes that were answered right, with and without a target.
       `slope_present`, `slope_absent`: fixations per item of the set, by least squares over them. Only where set sizes
       differ.
-    - `hit_rate`, `distance` (pixels), `overlap` (intersection over union): of the answers "here" (`game=detect`).
+    - `hit_rate`, `distance` (pixels), `overlap` (intersection over union): of the answers "here" (`game=detect`)
+      in scenes with a target.
     """
     if "set_size" not in facts or not len(facts["set_size"]):
         return {}

@@ -97,7 +97,8 @@ class GRU(nn.Module):
 class MinGRU(nn.Module):
     """A recurrence that is linear in its state (Feng et al. 2024): all steps at once, in log T rounds.
 
-    h_t = a_t h_{t-1} + (1 - a_t) c_t, where a_t and c_t depend on step t's input alone; a_t = 0 at an episode's start.
+    h_t = a_t h_{t-1} + (1 - a_t) c_t, where a_t and c_t depend on step t's input alone. At an episode's start h_{t-1}
+    counts as 0.
     """
 
     width: int

@@ -71,16 +71,17 @@ def write(
         raise refuse("out", out, "a new directory, or one that export has written")
     recorded, origin = golden.record(stored), _provenance(stored, source, command)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as made:
-            folder = Path(made) / out.name
-            fill(folder, stored, recorded, origin, dtype)
+        whole = out.resolve()  # `.` has neither a name nor a parent
+        whole.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=whole.parent, prefix=f".{whole.name}-") as made:
+            folder = Path(made) / whole.name
+            program = stablehlo.serialise(stored) if with_stablehlo else b""
+            fill(folder, stored, recorded, origin, dtype, program)
             found = run_check(folder)
             if with_stablehlo:
-                program = stablehlo.serialise(stored)
                 found += f"; {stablehlo.FILE}: logits within {stablehlo.check(program, recorded, stored.agent):.1e}"
-                (folder / stablehlo.FILE).write_bytes(program)
             out.mkdir(exist_ok=True)
+            (out / stablehlo.FILE).unlink(missing_ok=True)  # an earlier agent's
             for name in sorted(file.name for file in folder.iterdir() if file.is_file()):
                 (folder / name).replace(out / name)  # what else lies there is the user's
     except OSError as error:
@@ -89,9 +90,17 @@ def write(
 
 
 def fill(
-    folder: Path, stored: TrainedAgent, recorded: dict[str, Any], origin: Mapping[str, Any], dtype: str = "float32"
+    folder: Path,
+    stored: TrainedAgent,
+    recorded: dict[str, Any],
+    origin: Mapping[str, Any],
+    dtype: str = "float32",
+    program: bytes = b"",
 ) -> None:
-    """Makes the folder without checking it: network, arrays, recorded steps, code, and facts with all checksums."""
+    """Makes the folder without checking it: network, arrays, recorded steps, code, and facts with all checksums.
+
+    `program` is that of `stablehlo`, if it is to be there.
+    """
     folder.mkdir()
     config = stored.agent.config
     labels = {"game": config.game, "experiment": config.name, "env_steps": str(stored.env_steps)}
@@ -102,6 +111,8 @@ def fill(
     np.savez_compressed(folder / "golden.npz", **recorded)
     for name in CODE:
         shutil.copyfile(Path(__file__).parent / name, folder / name)
+    if program:
+        (folder / stablehlo.FILE).write_bytes(program)
     digests = {file.name: digest(file) for file in sorted(folder.iterdir())}
     more = {"dtype": dtype, "check": CHECKS[dtype], "provenance": origin, "files": digests}
     text = json.dumps(facts(stored) | more, indent=1)
@@ -177,7 +188,8 @@ def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
     """Describes the gaze, all points within bounds; `moves` are steps if `relative`, else focal points."""
     look, frame_shape = config.gaze, config.env.frame_shape
     low, high = gaze.limits(gaze=look, window=gaze.bounded(look, sensor), frame_shape=frame_shape)
-    relative = look.moves == "steps"
+    is_still = look.mode in ("none", "frozen")
+    relative = look.moves == "steps" or is_still
     moves = gaze.steps(look) if relative else gaze.targets(look, frame_shape)
     path = [np.clip(point, low, high).tolist() for point in look.path]
     start: Any = path[0] if look.mode == "scripted" else look.start
@@ -185,7 +197,7 @@ def _gaze(config: Config, sensor: Sensor) -> dict[str, Any]:
         start = [size // 2 for size in frame_shape]
     if start != "random":
         start = np.clip(start, low, high).tolist()
-    facts = {"mode": look.mode, "relative": relative, "moves": moves.tolist()}
+    facts = {"mode": look.mode, "relative": relative, "moves": [[0, 0]] if is_still else moves.tolist()}
     facts |= {"cost": look.cost, "cost_per": look.cost_per}
     return facts | {"start": start, "path": path, "limits": [low.tolist(), high.tolist()]}
 

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from foajax.config.schema import EnvConfig
+from foajax.envs.base import send
 from foajax.envs.gymnasium import make_frames
 from foajax.runs.agents import TrainedAgent
 from foajax.viewing import games
@@ -39,7 +40,7 @@ def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
         for name, value in row.items():
             if value is not None:
                 rows.setdefault(name, []).append(np.array(value))
-        environment.send(np.asarray(output.natural_action))
+        send(environment, np.asarray(output.natural_action), output.focal_point)
         timestep, _ = environment.recv()
     environment.close()
     golden = {name: np.concatenate(np.stack(values, axis=1)) for name, values in rows.items()}

@@ -75,6 +75,9 @@ def ring_count(sensor: RingSensor, frame_shape: Shape) -> PixelCount:
     actual = sum(math.prod(shape) for shape in ring_shapes(sensor))
     actual -= sum(int(hidden.sum()) for hidden in hidden_blocks(sensor))
     if sensor.peripheral is not None:
+        if any(length > size for length, size in zip(sensor.window, frame_shape, strict=True)):
+            accepted = f"a focal area inside the frame, {frame_shape[0]}x{frame_shape[1]}"
+            raise refuse("sensor.rings", sensor.window, accepted)
         least = centred = 1  # cells hidden along one axis, times those along the other
         for edges, size, length in zip(cell_edges(sensor, frame_shape), frame_shape, sensor.window, strict=True):
             hidden = [int(covered(edges, first, length).sum()) for first in range(size - length + 1)]

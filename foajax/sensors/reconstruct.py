@@ -30,8 +30,11 @@ def tables(sensor: Sensor, frame_shape: tuple[int, int]) -> Painting:
         images.append(jnp.arange(count, count + size, dtype=jnp.float32).reshape(shape))
         count += size
     height, width = sensor.window
-    # A frame that the focal area fills, and one that it has just left.
-    inside = sensor.picture(tuple(images), jnp.array([height // 2, width // 2]), (height, width))
+    # A peripheral grid may be finer than the focal area, so where that fits, it is cut out of a whole frame.
+    shape = frame_shape if height <= frame_shape[0] and width <= frame_shape[1] else (height, width)
+    top, left = shape[0] // 2 - height // 2, shape[1] // 2 - width // 2
+    inside = sensor.picture(tuple(images), jnp.array(shape) // 2, shape)[top : top + height, left : left + width]
+    # A frame that the focal area has just left.
     outside = jnp.array([height // 2 - height, width // 2 - width])
     beside = sensor.picture(tuple(images), outside, frame_shape)
     return Painting(*(np.asarray(p).round().astype(np.int32) - 1 for p in (inside, beside)))

@@ -158,8 +158,9 @@ class FoveatedVectorObservation(gymnasium.vector.VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begins all episodes, or those that `options["reset_mask"]` is true for. `seed` may be a list."""
-        if seed is not None:
-            self._generator = np.random.default_rng([s or 0 for s in np.atleast_1d(seed)])
+        seeds = np.atleast_1d(seed)
+        if any(each is not None for each in seeds):
+            self._generator = np.random.default_rng([each or 0 for each in seeds])
         started = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         observation, info = self.env.reset(seed=seed, options=options)
         self._ended = self._ended & ~started

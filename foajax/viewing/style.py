@@ -57,7 +57,8 @@ def draw_gaze(
     shape = pen.ellipse if sensor.is_round else pen.rectangle
     for i, (y, x, height, width) in reversed(list(enumerate(boxes(sensor, point)))):
         left, upper = round(across * x), round(top + down * y)
-        right, lower = round(across * (x + width)) - 1, round(top + down * (y + height)) - 1
+        right = max(left, round(across * (x + width)) - 1)  # one pixel, where an area is narrower than that
+        lower = max(upper, round(top + down * (y + height)) - 1)
         if halo:
             shape([left - 1, upper - 1, right + 1, lower + 1], outline=HALO, width=4)
         shape([left, upper, right, lower], outline=RINGS[i % len(RINGS)], width=2)

@@ -44,6 +44,8 @@ EPISODES = {
     "log-polar": ["experiment=logpolar", "gaze.step=7", "gaze.start=[70,3]"],
     "none": ["experiment=nonfoa"],
     "frozen": ["experiment=constant50_sub1_packed", "gaze=frozen", "gaze.start=[20,60]"],
+    "none, cells": ["experiment=constant50_sub1_packed", "gaze=none", "gaze.start=[20,60]", "gaze.moves=absolute"],
+    "frozen, cells": ["experiment=constant50_sub1_packed", "gaze=frozen", "gaze.start=[20,60]", "gaze.moves=absolute"],
     "scripted": ["experiment=constant50_sub2", "gaze=scripted", "gaze.path=[[0,0],[40,50],[79,20]]"],
     "as older agents": [
         *("experiment=constant70_packed", "network.last_actions=false", "network.last_reward=false"),

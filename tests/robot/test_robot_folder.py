@@ -14,6 +14,7 @@ import pytest
 
 from foajax import cli, export
 from foajax.config.parse import ConfigError, replace
+from foajax.envs.base import first_step
 from foajax.robot import golden
 from foajax.runs.agents import save_agent
 
@@ -183,6 +184,64 @@ def test_what_a_user_keeps_there_is_left_alone(make_stored, tmp_path, monkeypatc
     folder.write(stored, out, source="x")  # once more, over itself
     assert (out / "my_robot.py").read_text() == "# mine"
     assert "class Agent" in (out / "agent.py").read_text()
+
+
+def test_an_earlier_agents_program_is_removed_and_one_that_is_written_has_a_checksum(
+    make_stored, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(golden, "record", recorded)
+    monkeypatch.setattr(folder, "run_check", lambda path: "well")
+    monkeypatch.setattr(folder.stablehlo, "serialise", lambda stored: b"program")
+    monkeypatch.setattr(folder.stablehlo, "check", lambda program, recorded, agent: 0.0)
+    out, stored = tmp_path / "robot", make_stored("experiment=nonfoa")
+    program = out / "decide.stablehlo"
+    said = folder.write(stored, out, source="x", with_stablehlo=True)
+    assert said == "well; decide.stablehlo: logits within 0.0e+00" and program.read_bytes() == b"program"
+    assert json.loads((out / "agent.json").read_text())["files"][program.name] == folder.digest(program)
+    folder.write(stored, out, source="x")
+    assert not program.exists() and program.name not in json.loads((out / "agent.json").read_text())["files"]
+
+
+def test_the_directory_that_one_is_in_is_written_too(make_stored, tmp_path, monkeypatch):
+    monkeypatch.setattr(golden, "record", recorded)
+    monkeypatch.setattr(folder, "run_check", lambda path: "well")
+    out, stored = tmp_path / "robot", make_stored("experiment=nonfoa")
+    out.mkdir()
+    monkeypatch.chdir(out)
+    assert folder.write(stored, Path("."), source="x") == "well"
+    assert (out / "agent.json").exists() and list(tmp_path.iterdir()) == [out]
+    assert all(file.is_file() for file in out.iterdir())
+
+
+class Watched:
+    """An environment whose rules depend on the gaze; it keeps the focal points that it is told."""
+
+    num_envs, num_actions, crop_top, lives, reads_gaze = golden.GAMES, 4, 34, None, True
+
+    def __init__(self):
+        self.told = []
+
+    def reset(self):
+        return first_step(np.zeros((golden.GAMES, 210, 160), np.uint8))
+
+    recv = reset
+
+    def send(self, action, focal_point):
+        self.told.append(focal_point)
+
+    def render(self):
+        return np.zeros((golden.GAMES, 210, 160, 3), np.uint8)
+
+    def close(self):
+        pass
+
+
+def test_a_game_that_depends_on_the_gaze_is_told_where_the_recorded_agent_looks(make_stored, monkeypatch):
+    game, stored = Watched(), make_stored("experiment=constant50_sub2_packed", "gaze.start=random")
+    monkeypatch.setattr(golden.games, "environment", lambda stored, **options: game)
+    points = golden.record(stored)["focal_point"]
+    assert len(np.unique(points, axis=0)) > 10
+    np.testing.assert_array_equal(np.concatenate(np.stack(game.told, axis=1)), points)
 
 
 @pytest.mark.parametrize("kind", ["file", "directory of something else", "run", "shipped agent"])

@@ -14,6 +14,7 @@ from foajax.sensors.sense import picture, sense
 SENSORS = {
     "rings": RingSensor(rings=((10, 12, 1), (20, 20, 2), (30, 28, 4)), peripheral=(5, 5)),
     "odd": RingSensor(rings=((7, 7, 2), (15, 13, 3))),
+    "a grid finer than the area": RingSensor(rings=((16, 16, 1),), peripheral=(20, 20), layout="packed"),
     "whole": RingSensor(rings=((40, 36, 1),)),
     "retina": LogPolarSensor(rings=9, wedges=12, fovea=2.0, radius=30.0),  # larger than the frame
 }

@@ -156,6 +156,7 @@ def test_what_shows_no_pixels_is_refused(space):
     "sensor, gaze, message",
     [
         (RingSensor(rings=((18, 18, 2),)), None, r"sensor\.rings=\[18, 18\].*16x20"),
+        (RingSensor(rings=((18, 18, 2),), peripheral=(5, 5)), None, r"sensor\.rings=\[18, 18\].*16x20"),
         ("constant70", None, r"sensor\.rings=\[70, 70\].*16x20"),
         ("constant71", None, "experiment=constant71.*constant70"),
         (FULL, GazeConfig(start=(16, 3)), r"gaze\.start.*\[16, 3\].*16x20"),
@@ -248,6 +249,15 @@ def test_random_starts_of_the_vector_differ_and_come_from_the_seed():
     env.reset(seed=5)
     assert env.focal_point.tolist() == first != other
     assert len({tuple(point) for point in first}) > 1
+
+
+def test_a_list_of_no_seeds_leaves_the_random_starts_as_they_go_on():
+    env, starts = make_vector((3, 3), GazeConfig(start="random")), []
+    for seed in (None, [None, None]):
+        env.reset(seed=5)
+        env.reset(seed=seed)
+        starts.append(env.focal_point.tolist())
+    assert starts[0] == starts[1]
 
 
 def test_a_policy_of_another_library_can_find_what_is_off_the_window():
