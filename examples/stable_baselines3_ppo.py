@@ -1,6 +1,6 @@
 """Learns what to do and where to look with stable-baselines3's PPO.
 
-    pip install foajax stable-baselines3
+    pip install -e . stable-baselines3          # in a checkout of foajax
     python stable_baselines3_ppo.py ALE/Pong-v5 --steps 1000000
 
 PPO gives both actions as one `MultiDiscrete`, [natural, visual]. `VecNormalize` scales each value of an image by its

@@ -10,6 +10,7 @@ docs/results.md.
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -66,7 +67,7 @@ def reproduce(arguments: Sequence[str]) -> int:
         if options.show == "commands":
             for run in runs:
                 if not is_finished(run.config):
-                    print(f"python -m foajax.train {' '.join(run.words)}")
+                    print(f"python -m foajax.train {shlex.join(run.words)}")
             continue
         print(f"{about}: {len(runs)} runs", file=sys.stderr, flush=True)
         failed |= sweep.run_all(runs, jobs=options.jobs, stop=stop)

@@ -1,6 +1,6 @@
 #!/bin/bash
-# The paper's models as one job array: 7 models x 3 games x 3 seeds = 63 runs, each in a directory of its own
-# (runs/<game>-<experiment>-s<seed>). Submitted from the checkout, or from anywhere with foajax installed, with the
+# The paper's comparison as one job array: 7 models x 3 games x 3 seeds = 63 runs, as long as those of docs/results.md,
+# each in a directory of its own (runs/<game>-<experiment>-s<seed>). Submitted from the checkout, or from anywhere with foajax installed, with the
 # environment activated:
 #
 #   sbatch slurm/array.sh                                 # all of it, with this package's learner
@@ -24,19 +24,22 @@
 # For a GPU, with the extra `cuda`, take the first # of the next line away.
 ##SBATCH --gpus-per-task=1
 
-models=(nonfoa constant50_sub1 constant50_sub2 constant70 decreasing constant70_p decreasing_p)
+models=(nonfoa {constant50_sub1,constant50_sub2,constant70,decreasing,constant70_p,decreasing_p}_packed)
 games=(breakout pong beam_rider)
-seeds=(1 2 3)
+seeds=(0 1 2)
 
 i=${SLURM_ARRAY_TASK_ID:?submit this with sbatch}
 experiment=${models[i % ${#models[@]}]}
 game=${games[i / ${#models[@]} % ${#games[@]}]}
 seed=${seeds[i / (${#models[@]} * ${#games[@]})]}
+steps=3_000_000
+[[ $game == pong ]] && steps=1_500_000
 
 # Before the time is up the run is told to save, and the array task queues itself again.
 trap 'again=1; kill -USR1 "$run"' USR1
 srun --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" \
-  python -m foajax.train experiment="$experiment" game="$game" seed="$seed" env.threads="${SLURM_CPUS_PER_TASK:-1}" "$@" &
+  python -m foajax.train experiment="$experiment" game="$game" seed="$seed" train.env_steps="$steps" \
+  env.threads="${SLURM_CPUS_PER_TASK:-1}" "$@" &
 run=$!
 wait "$run"
 status=$?

@@ -29,7 +29,8 @@ def main(arguments: str) -> None:
 
     `arguments` are those of JAX's service, as JSON: a list and a mapping.
     """
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):  # meant for the run, which needs the service to stop
+    # Meant for the run, which needs the service to stop.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     positional, named = json.loads(arguments)
     port = int(positional[0].rpartition(":")[2])

@@ -38,8 +38,8 @@ RULES = f"""\
 - An agent with less than {100 * LEARNED:.0f} % of the best score in the table, both above random play, has not learned
   the game. Two such agents *cannot tell*.
 - These verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. With {SEEDS}, an interval goes
-  from the worst to the best seed, and holds the mean of all possible seeds three times in four. If two experiments
-  were equal, the one that is claimed to be better would still seem so by chance in one comparison of 20.
+  from the worst to the best seed; the true mean lies in it three times in four. Of two equal experiments, the one that
+  is claimed to be better would seem so by chance in one comparison of 20.
 - *{NOT_RUN.capitalize()}* means that a run which the claim needs is missing."""
 
 

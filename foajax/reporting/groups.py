@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,25 @@ def differing_keys(runs: Sequence[RunData]) -> dict[str, list[Any]]:
     keys = dict.fromkeys(key for each in flat for key in each)
     values = {key: [each.get(key) for each in flat] for key in keys if key not in _NOT_COMPARED}
     return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
+
+
+def check_seeds(runs: Sequence[RunData]) -> None:
+    """Raises `ConfigError` if runs that are averaged have the same seed or differ in length."""
+    check_lengths(runs)
+    paths: dict[int, Path] = {}
+    for run in runs:
+        if run.config.seed in paths:
+            accepted = f"another seed than that of {paths[run.config.seed]}"
+            raise refuse(str(run.path), accepted=accepted, why="repeats it")
+        paths[run.config.seed] = run.path
+
+
+def check_lengths(runs: Sequence[RunData]) -> None:
+    """Raises `ConfigError` if runs that are compared differ in `train.env_steps`."""
+    lengths = {run.config.train.env_steps: run for run in runs}
+    for steps, run in list(lengths.items())[1:]:
+        accepted = f"{next(iter(lengths)):,}, as the runs that it is compared with"
+        raise refuse(str(run.path), accepted=accepted, why=f"is of {steps:,} env_steps")
 
 
 def final_scores(groups: Groups) -> dict[str, Interval]:

@@ -127,6 +127,8 @@ def row(run: RunData) -> list[str]:
 
 def written(score: Mapping[str, Any]) -> str:
     """Writes a score's mean and standard error."""
+    if score["stderr"] is None:  # of a single game
+        return str(score["mean"])
     digits = 1 if score["stderr"] >= 0.05 else 3  # a scene of search earns 1 at most
     return f"{score['mean']:.{digits}f} ± {score['stderr']:.{digits}f}"
 

@@ -16,7 +16,7 @@ from foajax.config.schema import LearnerConfig
 from foajax.reporting import claims, kept, search
 from foajax.reporting.claims import CLAIMS, Claim, Finding, Game
 from foajax.reporting.curves import PAPER_NAMES, RunData, colours_of, draw_curves, save
-from foajax.reporting.groups import PRESETS, differing_keys, games_of
+from foajax.reporting.groups import PRESETS, check_lengths, check_seeds, differing_keys, games_of
 from foajax.reporting.markdown import fill, table
 from foajax.reporting.scores import Interval
 from foajax.sensors.registry import make_sensor
@@ -52,7 +52,8 @@ def by_game(runs: Sequence[RunData]) -> dict[str, Game]:
             continue
         labelled = {_label(seeds[0]): _in_core_time(seeds) for seeds in groups.values()}
         for label, seeds in labelled.items():
-            _check_seeds(label, seeds)
+            check_seeds(seeds)
+            _check_gaze(label, seeds[0])
         _check_protocol([labelled[each] for each in labelled if each in _COMPARED])
         heats = {label: list(filter(None, map(_heat, seeds))) for label, seeds in labelled.items()}
         games[name] = Game(name, labelled, heats)
@@ -75,17 +76,10 @@ def _heat(run: RunData) -> heatmap.HeatMap | None:
     return heatmap.of_run(run.path, kept.record(run)["env_steps"])
 
 
-def _check_seeds(label: str, seeds: Sequence[RunData]) -> None:
-    _check_lengths(seeds)
-    paths: dict[int, Path] = {}
-    for run in seeds:
-        if run.config.seed in paths:
-            accepted = f"another seed than that of {paths[run.config.seed]}"
-            raise refuse(str(run.path), accepted=accepted, why="repeats it")
-        paths[run.config.seed] = run.path
-        mode = run.config.gaze.mode
-        if label in _COMPARED and mode not in ("learned", "none") and not label.endswith(f"-{mode}"):
-            raise refuse(str(run.path), accepted=f"name={run.config.name}-{mode}", why=f"has a {mode} gaze")
+def _check_gaze(label: str, run: RunData) -> None:
+    mode = run.config.gaze.mode
+    if label in _COMPARED and mode not in ("learned", "none") and not label.endswith(f"-{mode}"):
+        raise refuse(str(run.path), accepted=f"name={run.config.name}-{mode}", why=f"has a {mode} gaze")
 
 
 def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
@@ -95,14 +89,7 @@ def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:
             other = next(run for run, value in zip(first, values, strict=True) if value != values[0])
             accepted = f"the same {key} as in {first[0].path}"
             raise refuse(str(other.path), accepted=accepted, why="is compared with runs of another kind")
-    _check_lengths(first)
-
-
-def _check_lengths(runs: Sequence[RunData]) -> None:
-    lengths = {run.config.train.env_steps: run for run in runs}
-    for steps, run in list(lengths.items())[1:]:
-        accepted = f"{next(iter(lengths)):,}, as the runs that it is compared with"
-        raise refuse(str(run.path), accepted=accepted, why=f"is of {steps:,} env_steps")
+    check_lengths(first)
 
 
 def page(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
@@ -152,8 +139,8 @@ command with `decreasing_p` the second."""
 
 _PROTOCOL = """\
 ## How the runs were made
-- **Training**: the default learner, 3,000,000 decisions (Pong 1,500,000) of 4 frames each. A sensor that has a packed
-  layout uses it.
+- **Training**: the default learner, if nothing else is said below, and 3,000,000 decisions (Pong 1,500,000) of 4
+  frames each. A sensor that has a packed layout uses it.
 - **Score**: 100 whole games of the final policy, with sampled actions.
 - **Curves**: each point is the mean of the last 100 games of training, with no other smoothing. 500 points of each
   curve are kept. With several seeds, thin lines are seeds, the thick line is their mean, and the band is the mean's
@@ -170,19 +157,21 @@ def _protocol(games: Mapping[str, Game]) -> str:
 
     text = _PROTOCOL
     for game in games.values():
-        learners = [game.runs[label][0].config.learner for label in game.runs if label in _COMPARED]
-        if learners and (words := _unlike_default(learners[0])):  # they share it: see `_check_protocol`
-            text += f"\n\nOn {GAMES[game.name]} the learner was today's default with {', '.join(words)}."
+        if other := _other_learner(game):
+            text += f"\n\nOn {GAMES[game.name]} {other}"
     if facts:
         pythons, cpus = each(fact["python"] for fact in facts), each(fact["cpu"] for fact in facts)
         text += f"\n\nPython {pythons}, jax {each(fact['packages']['jax'] for fact in facts)}, {cpus}."
     return text
 
 
-def _unlike_default(learner: LearnerConfig) -> list[str]:
+def _other_learner(game: Game) -> str:
+    """Says how the learner of the runs that are compared, which share it, differs from the default; else ""."""
+    first = next((game.runs[label][0] for label in game.runs if label in _COMPARED), None)
+    then = flatten(to_mapping(first.config.learner)) if first else ()
     today = dict(flatten(to_mapping(LearnerConfig())))
-    then = flatten(to_mapping(learner))
-    return [f"`learner.{key}={json.dumps(value)}`" for key, value in then if value != today[key]]
+    words = [f"`learner.{key}={json.dumps(value)}`" for key, value in then if value != today[key]]
+    return f"the learner was today's default with {', '.join(words)}." if words else ""
 
 
 def _verdicts(chosen: Sequence[Claim], findings: Mapping[str, Mapping[str, Finding]], head: str) -> str:
@@ -289,17 +278,28 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
     whole, learned, frozen = (_worth(game, label).value for label in list(_GAZES)[:3])
     one = any(len(game.runs[label]) == 1 for label in there)
     over_what = f"over seeds{'; where there is one seed, over its games' if one else ', from the worst to the best'}"
-    verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
-    found = [verdict for verdict in dict.fromkeys(verdicts) if verdict != claims.NOT_RUN] + [claims.NOT_RUN]
-    counts = (f"{verdict}: {verdicts.count(verdict)}" for verdict in found if verdict in verdicts)
+    other = _other_learner(game)
     return (
         f"On Breakout a learned gaze scores {learned / frozen:.1f} times as much as a frozen one, and "
-        f"{learned / whole:.2f} of what the whole frame\nscores. Both gazes see a fifth of its values.{_best(game)}\n\n"
+        f"{learned / whole:.2f} of what an agent\nscores that sees the whole frame. "
+        f"Both gazes see a fifth of its pixel values.{_best(game)}\n\n"
         "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
         f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
         f"Score: mean of 100 whole games. Brackets: 95 % intervals {over_what}.\n"
-        "Ratios are of scores above random play.\n\n"
-        f"The paper's {len(verdicts)} claims on Breakout: {'; '.join(counts)}. [All results](docs/results.md).\n"
+        f"Ratios are of scores above random play.{other and f' In these runs {other}'}\n\n"
+        f"{_verdicts_in_words(game)} [All results](docs/results.md).\n"
+    )
+
+
+def _verdicts_in_words(game: Game) -> str:
+    verdicts = [claims.ask(claim, game).verdict for claim in CLAIMS if claim.says]
+    missing = verdicts.count(claims.NOT_RUN)
+    yes, no = (sum(verdict.endswith(ends) for verdict in verdicts) for ends in ((" yes", "holds"), (" no", "not hold")))
+    few = any("seed" in verdict for verdict in verdicts)
+    return (
+        f"Of the paper's {len(verdicts)} claims, {yes} hold on Breakout, {no} do not and "
+        f"{len(verdicts) - yes - no - missing} stay open{', as far as so few seeds can tell' if few else ''}."
+        + (f" Runs for {missing} are missing." if missing else "")
     )
 
 

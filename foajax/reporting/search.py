@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from foajax.config.schema import Config, GazeConfig, RingSensor
 from foajax.envs.search import optimal_return
 from foajax.reporting import claims, cost
 from foajax.reporting.curves import RunData, colours_of, save
+from foajax.reporting.groups import check_seeds
 from foajax.reporting.markdown import fill, table
 from foajax.reporting.scores import CONFIDENCE, Interval
 from foajax.sensors.registry import make_sensor
@@ -65,8 +67,9 @@ def over_seeds(values: Sequence[float]) -> Interval:
 
 
 def measure(runs: Sequence[RunData], name: str) -> Interval:
-    """Averages a measure of the runs' evaluations (`foajax.envs.measures.summarise`)."""
-    return over_seeds([_measures(run)[name] for run in runs])
+    """Averages a measure of the evaluations (`foajax.envs.measures.summarise`) over the runs that have it."""
+    values = [_measures(run)[name] for run in runs if name in _measures(run)]
+    return over_seeds(values or [math.nan])
 
 
 def earned(runs: Sequence[RunData], size: int) -> Interval:
@@ -161,7 +164,10 @@ def _costs(runs: Sequence[RunData]) -> str:
         answer = looked * decisions
         rows.append([_size(shape), *(f"{n / 1e6:,.2f}" for n in (looked, answer, once)), f"{once / answer:,.0f}"])
     head = ["frame", "MFLOP a decision", "MFLOP an answer", "MFLOP of the whole frame, once", "ratio"]
-    return f"{table(head, rows)}\n\nReckoned: an answer takes {decisions:.3g} decisions, as at {_size(SHAPES[0])}."
+    return (
+        f"{table(head, rows)}\n\nThe same network looks or sees the whole frame. Arithmetic is calculated, for the "
+        f"{decisions:.3g} decisions that an answer takes at {_size(SHAPES[0])}."
+    )
 
 
 def _size(shape: tuple[int, int]) -> str:
@@ -203,11 +209,13 @@ def _line(plot: Any, found: Sequence[Interval], **style: Any) -> None:
 
 
 def grouped(runs: Sequence[RunData]) -> dict[str, list[RunData]]:
-    """Groups the runs of search and detection by name."""
+    """Groups the runs of search and detection by name; raises `ConfigError` as `check_seeds` does."""
     groups: dict[str, list[RunData]] = {}
     for run in runs:
         if run.config.searches:
             groups.setdefault(run.config.name, []).append(run)
+    for runs in groups.values():
+        check_seeds(runs)
     return groups
 
 

@@ -45,9 +45,12 @@ import numpy as np
 from agent import Agent
 Agent(sys.argv[1], source="camera").decide(np.zeros((1080, 1920, 3), np.uint8))
 seconds = time.perf_counter() - begin
-# The peak of this program alone: what getrusage says begins with the peak of the process that it was forked from.
-peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
-print(json.dumps({"start_s": seconds, "memory_mb": int(peak.split()[1]) / 1024}))
+if sys.platform == "darwin":
+    import resource
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+else:  # there it begins with the peak of the process that this one was forked from
+    peak = int(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+print(json.dumps({"start_s": seconds, "memory_mb": peak / 1024}))
 """
 
 

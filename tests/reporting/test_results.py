@@ -229,11 +229,13 @@ def test_the_page_and_the_readme_of_some_runs(checkout):
     assert "| `constant70_p` | 1,241 | 1 | 100" in page and "| 7.5 | 0.35 | 0.15 | 2.4 |" in page  # 1.2 hours, 2 cores
     assert "| `decreasing` |  |  | not run yet |" in page and "## Pong\nNot run yet." in page
     assert "one seed suggests yes" in page and "Python 3.12.1, jax 0.11.2, a processor." in page
-    assert readme.startswith("before\n<!-- results: made by x -->\nOn Breakout") and "old" not in readme
+    assert readme.startswith("before\n<!-- results: made by x -->\nOn Breakout") and "\nold" not in readme
     assert "2.6 times as much as a frozen one, and 0.83 of" in readme  # less 1.7 of random play
     assert "| gaze frozen (`constant70_p_packed-frozen`) |" in readme
     assert "| whole frame (`nonfoa`) | 6,400 | 1 | 120 [" in readme and readme.count("| gaze ") == 2
-    assert "\n<!-- /results -->\nafter\n" in readme
+    assert "\n<!-- /results -->\nafter\n" in readme and "In these runs" not in readme
+    assert "Of the paper's 12 claims, 3 hold on Breakout, 1 do not and 0 stay open, as far as so few seeds" in readme
+    assert "Runs for 8 are missing." in readme
     for link in ("breakout-gaze.png", "breakout-constant.png", "breakout-heat-constant70.png"):
         assert f"(results/{link})" in page and (checkout / "docs/results" / link).stat().st_size > 5000
 
@@ -308,3 +310,11 @@ def test_the_page_in_the_repository_is_what_its_runs_say():
     assert (results.ROOT / "docs/results.md").read_text() == results.page(games, costs)
     text, readme = results.block(games, costs), (results.ROOT / "README.md").read_text()
     assert fill(readme, text) == readme
+
+
+def test_the_readme_says_where_the_learner_was_not_todays(checkout):
+    for path in (checkout / "results/runs/breakout").iterdir():
+        config = path / "config.yaml"
+        config.write_text(config.read_text().replace("normalize_advantages: false", "normalize_advantages: true"))
+    block = results.block(results.by_game(kept.runs(checkout / "results/runs")), [])
+    assert "In these runs the learner was today's default with `learner.normalize_advantages=true`.\n" in block

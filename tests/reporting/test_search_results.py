@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from foajax.config.compose import compose
+from foajax.config.parse import ConfigError
 from foajax.reporting import claims, kept, results, search
 from foajax.reporting.curves import RunData
 from foajax.reporting.markdown import fill
@@ -62,6 +63,22 @@ def test_the_page_has_what_was_run_and_says_what_was_not(tmp_path):
     assert len(ratios) == 2 and 1 < ratios[0] < ratios[1] and ratios[1] > 50
     with Image.open(tmp_path / "results" / "search.png") as figure:
         assert figure.width > 1000
+
+
+def test_a_seed_counts_once_and_all_are_of_one_length(tmp_path):
+    runs = [run_of(tmp_path / str(i), "search_rings_p", 0.9, seed=seed) for i, seed in enumerate((0, 1, 0))]
+    with pytest.raises(ConfigError, match=r"/2: repeats it; accepted is another seed than that of .*/0$"):
+        search.grouped(runs)
+    longer = compose(["experiment=search_rings_p", "seed=2", "train.env_steps=6000000"])
+    with pytest.raises(ConfigError, match="is of 6,000,000 env_steps"):
+        search.grouped([*runs[:2], runs[2]._replace(config=longer)])
+
+
+def test_a_seed_that_never_says_absent_is_left_out_of_its_fixations(tmp_path):
+    runs = [run_of(tmp_path, "search_rings_p-letter", 0.9, seed=seed) for seed in range(2)]
+    del runs[0].evaluation["measures"]["slope_absent"]
+    assert search.measure(runs, "slope_absent") == (1.0, 1.0, 1.0)
+    assert np.isnan(search.measure(runs[:1], "slope_absent").value)
 
 
 def test_the_page_in_the_repository_is_what_its_runs_say():
