@@ -20,7 +20,7 @@ from pydantic import Field
 from foajax import cli
 from foajax.config.compose import choices, compose
 from foajax.config.parse import Section, refuse
-from foajax.config.schema import Config, Point
+from foajax.config.schema import Config, Point, Shape
 from foajax.envs.make import make
 from foajax.sensors.frames import to_frame
 from foajax.sensors.registry import make_sensor
@@ -33,6 +33,7 @@ class Options(Section):
     points: tuple[Point, ...] = Field((), description="Focal points in frame pixels; none for the frame's centre.")
     out: str = Field("show.png", description="The image, a .png file.")
     color: bool = Field(False, alias="env.color", description="Frames in colour; else gray.")
+    frame_shape: Shape = Field((80, 80), alias="env.frame_shape", description="Height and width of frames in pixels.")
     steps: int = Field(60, ge=0, description="Random actions before the frame is taken.")
     seed: int = Field(0, description="Seed of the game.")
     all: bool = Field(False, description="The same as sensor=all.")
@@ -66,7 +67,9 @@ def show(arguments: Sequence[str]) -> None:
     sheet = options.all or options.sensor == "all"
     if sheet and own:
         raise refuse(own[0], accepted="a key of one sensor, without sensor=all")
-    words = [*own, f"game={options.game}", f"seed={options.seed}", f"env.color={options.color}", "gaze=none"]
+    shape = list(options.frame_shape)
+    words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
+    words += [f"env.color={options.color}", f"env.frame_shape={shape}"]
     configs = {name: compose([f"sensor={name}", *words]) for name in (ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape

@@ -91,6 +91,14 @@ def test_the_heading_counts_values():
     assert sheet._heading(FRAME, nonfoa, "nonfoa") == ("nonfoa", "6,400 values, 100% of the frame")
 
 
+def test_a_sensor_of_search_is_drawn_on_frames_of_its_size(tmp_path):
+    out = tmp_path / "view.png"
+    words = ["sensor=search_rings_p", "game=search", "env.frame_shape=[160,160]", "points=[[150,30]]", "steps=0"]
+    assert cli.run(show.show, [*words, f"out={out}"]) == 0
+    with Image.open(out) as image:
+        assert image.width > 3 * 160
+
+
 @pytest.fixture
 def still(monkeypatch):
     """A frame without a game."""
@@ -159,6 +167,7 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
             "sensor.ring=3: unknown key (did you mean sensor.rings?); accepted is one of rings, kind, peripheral, ",
         ),
         ("sensor=all sensor.layout=packed", "sensor.layout=packed: accepted is a key of one sensor, without sensor=a"),
+        ("env.frame_shape=[0,80]", "env.frame_shape=[0, 80]: accepted is [height, width], each from 8 to 10000"),
         ("points=[[40,80]]", "points=[40, 80]: accepted is [y, x] inside the frame, 80x80"),
         ("points=40", "points=40: accepted is a list of [y, x]"),
         ("steps=-1", "steps=-1: accepted is an integer >= 0"),
