@@ -314,7 +314,7 @@ class NetworkConfig(Section):
     )
     lstm_norm: bool = Field(True, description="Apply layer norm to what the core's gates get from its inputs.")
     priority_map: bool = Field(
-        False, description="Prefer to look at those cells of the background that match a query from the core."
+        False, description="Prefer to look at those cells of the periphery that match a query from the core."
     )
     normalization: Literal["pixel", "running", "frame", "none"] = Field(
         "pixel", description="Mean subtracted from frames: running per pixel, running over all, or each frame's own."
