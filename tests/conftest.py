@@ -33,9 +33,7 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"):
         os.environ[name.upper()] = str(jax.config.values[name])
-    logging.raiseExceptions = (
-        False  # absl may hold the stderr of an earlier test, and would say on ours that it is closed
-    )
+    logging.raiseExceptions = False  # absl may hold the stderr of an earlier test and say on ours that it is closed
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as behind a shell's `&`; what is ignored is inherited
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
