@@ -17,7 +17,7 @@ from pydantic import Field
 
 from foajax import cli
 from foajax.config.parse import ConfigError, Section, refuse
-from foajax.reporting import bench, kept, results
+from foajax.reporting import bench, kept, results, search
 from foajax.reporting.curves import read_run
 
 
@@ -39,8 +39,10 @@ def keep(arguments: Sequence[str]) -> None:
     if options.run is not None:
         new = kept.keep(Path(options.run), options.name)
         others = [run for run in before if run.path != new]
+        together = [*others, read_run(new)]
         try:
-            results.by_game([*others, read_run(new)])
+            results.by_game(together)
+            search.grouped(together)
         except ConfigError:
             if len(others) == len(before):
                 shutil.rmtree(new)
