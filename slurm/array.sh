@@ -1,7 +1,7 @@
 #!/bin/bash
 # The paper's comparison as one job array: 7 models x 3 games x 3 seeds = 63 runs, as long as those of docs/results.md,
-# each in a directory of its own (runs/<game>-<experiment>-s<seed>). Submitted from the checkout, or from anywhere with foajax installed, with the
-# environment activated:
+# each in a directory of its own (runs/<game>-<experiment>-s<seed>). Submitted from the checkout, or from anywhere with
+# foajax installed, with the environment activated:
 #
 #   sbatch slurm/array.sh                                 # all of it, with this package's learner
 #   sbatch slurm/array.sh learner=paper network=a3c 'run=runs/paper/${game}-${name}-s${seed}'  # with Table III's
