@@ -223,7 +223,7 @@ def check_same_run(path: Path, config: Config) -> None:
 def _has_begun(path: Path) -> bool:
     """Whether the run has a row of metrics or a checkpoint."""
     rows, checkpoints = path / "metrics.jsonl", path / "checkpoints"
-    return (rows.exists() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
+    return (rows.is_file() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
 
 
 def _word(key: str, value: Any) -> str:
