@@ -35,23 +35,28 @@ def keep(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments)
     if not kept.KEPT.is_dir():
         raise refuse(str(kept.KEPT), accepted="a checkout of foajax, which has this directory", why="is missing")
-    before = kept.runs()
     if options.run is not None:
-        new = kept.keep(Path(options.run), options.name)
-        others = [run for run in before if run.path != new]
-        together = [*others, read_run(new)]
-        try:
-            results.by_game(together)
-            search.grouped(together)
-        except ConfigError:
-            if len(others) == len(before):
-                shutil.rmtree(new)
-            raise
-        print(new)
+        print(_add(Path(options.run), options.name))
     runs = kept.runs()
     kept.write_table(runs)
     results.write(runs)
     bench.write_table()
+
+
+def _add(path: Path, name: str | None) -> Path:
+    """Keeps a run; takes it away again and raises `ConfigError` if the pages refuse it beside those that are kept."""
+    before = kept.runs()
+    new = kept.keep(path, name)
+    others = [run for run in before if run.path != new]
+    together = [*others, read_run(new)]  # the new one last, so that an error names it
+    try:
+        results.by_game(together)
+        search.grouped(together)
+    except ConfigError:
+        if len(others) == len(before):
+            shutil.rmtree(new)
+        raise
+    return new
 
 
 if __name__ == "__main__":

@@ -67,9 +67,8 @@ def show(arguments: Sequence[str]) -> None:
     sheet = options.all or options.sensor == "all"
     if sheet and own:
         raise refuse(own[0], accepted="a key of one sensor, without sensor=all")
-    shape = list(options.frame_shape)
     words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
-    words += [f"env.color={options.color}", f"env.frame_shape={shape}"]
+    words += [f"env.color={options.color}", f"env.frame_shape={list(options.frame_shape)}"]
     configs = {name: compose([f"sensor={name}", *words]) for name in (ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape

@@ -111,10 +111,14 @@ def training_score(runs: Sequence[RunData], *, share: float) -> Interval:
     return interval([np.array(means)], np.mean)
 
 
+def chance(game: str) -> float:
+    """Returns the score of random play, 0 in a game without a reference."""
+    return REFERENCE.get(game, (0.0, 0.0))[0]
+
+
 def above_chance(score: Interval, game: str) -> Interval:
-    """Subtracts the score of random play, which is taken as 0 in a game without a reference."""
-    chance = REFERENCE.get(game, (0.0, 0.0))[0]
-    return Interval(*(each - chance for each in score))
+    """Subtracts the score of random play."""
+    return Interval(*(each - chance(game) for each in score))
 
 
 def over(a: Interval, b: Interval) -> Interval:
@@ -150,7 +154,8 @@ def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) ->
 
 def _least(game: Game) -> float:
     """Returns the score above random play from which on an agent has learned the game."""
-    return LEARNED * max(above_chance(score(runs), game.name).value for runs in game.runs.values())
+    best = max(np.mean([run.final_score for run in runs]) for runs in game.runs.values())
+    return LEARNED * (float(best) - chance(game.name))
 
 
 def _compare(
@@ -187,8 +192,7 @@ def _longer(slow: str, fast: str) -> Callable[[Game], list[Part | None]]:
         groups = game.runs[slow], game.runs[fast]
         seeds = min(map(len, groups))
         for name, runs in zip((slow, fast), groups, strict=True):
-            last = Interval(*[float(np.mean([run.score[-1] for run in runs]))] * 3)
-            if above_chance(last, game.name).value < _least(game):
+            if np.mean([run.score[-1] for run in runs]) - chance(game.name) < _least(game):
                 return [Part(_ANYTHING, seeds, f"`{name}` has not learned")]
         steps, hours = (times_longer(*groups, axis) for axis in ("env_steps", "time"))
         if steps is None or hours is None:

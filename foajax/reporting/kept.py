@@ -16,7 +16,7 @@ from foajax.config.parse import refuse, replace, to_mapping
 from foajax.config.schema import Config
 from foajax.reporting.curves import RunData, read_run
 from foajax.reporting.markdown import table
-from foajax.runs.directory import FREE, compared, load_config
+from foajax.runs.directory import FREE, compared, differing, load_config
 from foajax.runs.rows import parse_row
 from foajax.runs.status import newest_checkpoint
 from foajax.sensors.registry import make_sensor
@@ -52,7 +52,8 @@ def keep(path: Path, name: str | None) -> Path:
     config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
     out = KEPT / game / (name or f"{config.name}-s{config.seed}")
-    if out.exists() and not _same(load_config(out), config):
+    may_differ = FREE - {"name", "train.env_steps"}
+    if out.exists() and not may_differ.issuperset(differing(compared(load_config(out)), compared(config))):
         raise refuse("name", out.name, "another name=<name>-s<seed>", why="holds another run")
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(yaml.safe_dump(to_mapping(config), sort_keys=False))
@@ -66,12 +67,6 @@ def keep(path: Path, name: str | None) -> Path:
     (out / "score.json").write_text(json.dumps({**(run.evaluation or {}), "run": out.name}, indent=1) + "\n")
     (out / "run.json").write_text(json.dumps(_facts(run, newest), indent=1) + "\n")
     return out
-
-
-def _same(first: Config, second: Config) -> bool:
-    a, b = compared(first), compared(second)
-    differing = {key for key in a | b if a.get(key) != b.get(key)}
-    return differing <= FREE - {"name", "train.env_steps"}
 
 
 def protocol(config: Config) -> tuple[int, bool]:

@@ -14,7 +14,7 @@ import contextlib
 import json
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +186,11 @@ def compared(config: Config) -> dict[str, Any]:
     return {key: value for key, value in flatten(to_mapping(config)) if not key.startswith("train.logger")}
 
 
+def differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Lists the keys whose values differ between two runs (`compared`)."""
+    return [key for key in dict.fromkeys([*first, *second]) if first.get(key) != second.get(key)]
+
+
 def _settle_config(path: Path, config: Config) -> None:
     """Writes ``config.yaml`` if it is new or differs only as it may (`FREE`); else raises RunError."""
     text = yaml.safe_dump(to_mapping(config), sort_keys=False)
@@ -209,8 +214,7 @@ def check_same_run(path: Path, config: Config) -> None:
         return
     # With a falling learning rate the length of the run is part of what a step learns.
     free = FREE - {"train.env_steps"} if config.learner.schedule == "linear" else FREE
-    keys = [k for k in dict.fromkeys([*asked, *stored]) if asked.get(k) != stored.get(k) and k not in free]
-    if keys:
+    if keys := [key for key in differing(asked, stored) if key not in free]:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
         still = FREE if stored["learner.schedule"] == "constant" else ()
         words = shlex.join(_word(key, stored[key]) for key in keys if key in stored and key not in still)
