@@ -143,7 +143,7 @@ def test_the_page(runs, tmp_path, capsys, monkeypatch):
     words = [*map(str, runs), f"out={out}", "episodes=0", "repeats=1"]
     assert cli.run(report.report, words) == 0
     assert capsys.readouterr().out.strip() == str(out / "index.html")
-    for name in ("curves-seek.png", "scores.png", f"heatmap-{runs[0].name}.png"):
+    for name in ("curves-seek.png", "scores.png", "heatmap-seek-constant70_p_packed-s0.png"):
         with Image.open(out / name) as image:
             assert min(image.size) > 200
     page = (out / "index.html").read_text()
@@ -153,6 +153,17 @@ def test_the_page(runs, tmp_path, capsys, monkeypatch):
     assert "<td>constant50_sub2_packed</td>" in page and "7.5 [4, 11]" in page
     assert "<td><code>learner.learning_rate</code></td><td>0.002</td><td>0.001</td>" in page
     assert re.search(r"<td class=\"number\">625</td><td class=\"number\">10 %</td>", page)
+
+
+def test_kept_runs_of_two_games_have_two_heat_maps(tmp_path):
+    kept = []
+    for game in ("pong", "breakout"):
+        (tmp_path / game).mkdir()
+        kept.append(make_run(tmp_path / game, "constant70-s0", words=[f"game={game}"], scores=[1.0]))
+    maps = dict.fromkeys(kept, CURRENT)
+    report_page._add_maps(report_page.Page(tmp_path), list(map(curves.read_run, kept)), maps, tmp_path)
+    names = [f"heatmap-{game}-constant70-s0.png" for game in ("breakout", "pong")]
+    assert sorted(file.name for file in tmp_path.glob("heatmap*")) == names
 
 
 @browser_needed

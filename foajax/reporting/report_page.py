@@ -144,7 +144,8 @@ def _add_maps(page: Page, runs: Sequence[RunData], maps: Mapping[Path, HeatMap],
         if run.path in maps:
             title = f"{run.config.name} on {run.config.game}"
             figure = heatmap.draw(maps[run.path], title)
-            file = directory / f"heatmap-{file_name(run.path.name)}.png"
+            name = file_name(f"{run.config.game}-{run.config.name}-s{run.config.seed}")
+            file = directory / f"heatmap-{name}.png"
             figure.savefig(file, dpi=130)
             page.add(f"<div>{_image(file.read_bytes(), 'png', f'heat map of {title}')}</div>")
     page.add("</div>")
