@@ -158,7 +158,7 @@ class Sensor:
 
     def look(self, frame: np.ndarray, focal_point: np.ndarray) -> list[np.ndarray]:
         """Returns the normalised images, float32 [h, w] each, at a focal point (y, x)."""
-        frame = (frame - frame.mean()) / max(frame.std(), np.float32(1e-3)) if self._by_frame else frame
+        frame = (frame - frame.mean()) / np.maximum(frame.std(), np.float32(1e-3)) if self._by_frame else frame
         frame, arrays, sensor = np.atleast_3d(frame)[..., self._channel], self._arrays, self._sensor
         top, left = (focal_point - self._window // 2).tolist()
         window = self._cut(frame, top, left) - self._cut(arrays["mean"][self._channel], top, left)
