@@ -52,6 +52,21 @@ def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return directories, others
 
 
+def take_directory(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """Separates the directory of `--config-dir`, which holds the user's own choices, from the other words."""
+    words = list(arguments)
+    for i, word in enumerate(words):
+        flag, is_joined, value = word.partition("=")
+        if flag in ("--config-dir", "-cd"):
+            end = i + (1 if is_joined else 2)
+            given = value if is_joined else "".join(words[i + 1 : end])
+            directory = Path(given).absolute()
+            if not directory.is_dir() or end > len(words):
+                raise refuse(flag, given, "a directory with experiment/, sensor/, network/ or learner/")
+            return directory, words[:i] + words[end:]
+    return None, words
+
+
 def _values(arguments: Sequence[str], cls: type[Section], prefix: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     keys = schema_of(cls)["properties"]

@@ -3,7 +3,8 @@
 Each focal point gets a row: the frame with the focal area drawn on it, and what the sensor sees, put back in its
 place. A packed sensor's row has its images too, which are all that the network gets. `sensor=all` draws the paper's
 sensors and the log-polar one on one sheet. Keys of the sensor change it:
-`sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`.
+`sensor=rings 'sensor.rings=[[16,16,1],[48,48,4]]' sensor.layout=packed`. `--config-dir=DIR` adds the sensors of
+DIR/sensor/, as in `foajax train`.
 
 Frames are not normalised, so black may be a black pixel or a hidden one. The frame's brightest pixel is drawn white.
 """
@@ -42,8 +43,6 @@ class Options(Section):
         if not self.out.endswith(".png"):
             raise refuse("out", self.out, "a file name that ends in .png")
         cli.check_file("out", self.out)
-        if self.sensor not in (known := [*choices()["sensor"], "all"]):
-            raise refuse("sensor", self.sensor, known)
 
 
 def walk(config: Config, steps: int) -> np.ndarray:
@@ -62,14 +61,17 @@ def walk(config: Config, steps: int) -> np.ndarray:
 
 def show(arguments: Sequence[str]) -> None:
     """Draws what sensors see and prints the path of the picture."""
+    directory, arguments = cli.take_directory(arguments)
     own = [word for word in arguments if word.startswith("sensor.")]
     options = cli.parse(Options, [word for word in arguments if word not in own])
+    if options.sensor not in (known := [*choices(directory)["sensor"], "all"]):
+        raise refuse("sensor", options.sensor, known)
     sheet = options.all or options.sensor == "all"
     if sheet and own:
         raise refuse(own[0], accepted="a key of one sensor, without sensor=all")
     words = [*own, f"game={options.game}", f"seed={options.seed}", "gaze=none"]
     words += [f"env.color={options.color}", f"env.frame_shape={list(options.frame_shape)}"]
-    configs = {name: compose([f"sensor={name}", *words]) for name in (ALL if sheet else (options.sensor,))}
+    configs = {name: compose([f"sensor={name}", *words], directory) for name in (ALL if sheet else (options.sensor,))}
     config = next(iter(configs.values()))
     height, width = config.env.frame_shape
     points = options.points or ((height // 2, width // 2),)

@@ -123,9 +123,19 @@ def test_a_sensor_of_ones_own(still, tmp_path, monkeypatch):
     monkeypatch.setattr(
         show, "draw", lambda frame, sensor, points, name: drawn.append(sensor.config) or Image.new("RGB", (9, 9))
     )
-    for words in (["sensor=rings", "sensor.rings=[[40,40,1]]"], ["sensor=constant70", "sensor.pooling=stride"]):
+    (tmp_path / "sensor").mkdir()
+    (tmp_path / "sensor" / "mine.yaml").write_text("rings: [[16, 16, 1]]\n")
+    for words in (
+        ["sensor=rings", "sensor.rings=[[40,40,1]]"],
+        ["sensor=constant70", "sensor.pooling=stride"],
+        ["sensor=mine", f"--config-dir={tmp_path}"],
+    ):
         assert cli.run(show.show, [*words, f"out={tmp_path / 'own.png'}"]) == 0
-    assert drawn == [RingSensor(rings=((40, 40, 1),)), RingSensor(rings=((70, 70, 2),), pooling="stride")]
+    assert drawn == [
+        RingSensor(rings=((40, 40, 1),)),
+        RingSensor(rings=((70, 70, 2),), pooling="stride"),
+        RingSensor(rings=((16, 16, 1),)),
+    ]
 
 
 @pytest.mark.parametrize("word", ["all=true", "sensor=all"])
@@ -161,6 +171,7 @@ def test_a_frame_of_a_game_that_needs_no_emulator():
     "word, message",
     [
         ("sensor=constant71", "sensor=constant71: did you mean constant70? accepted is one of"),
+        ("--config-dir=nowhere", "--config-dir=nowhere: accepted is a directory with experiment/, sensor/"),
         ("sensor=rings", "sensor.rings: missing; accepted is a list of one or more [height, width, factor] with "),
         (
             "sensor.ring=3",

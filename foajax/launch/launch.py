@@ -57,12 +57,12 @@ def run(task: Task, arguments: Sequence[str], *, check: Callable[[Config], None]
     does not end the sweep. A `ConfigError`, also from `task`, becomes one line on stderr and exit code 2.
     """
     if not {"-h", "--help"}.isdisjoint(arguments):
-        return cli.run(lambda words: print(_help(_take_directory(words)[0])), arguments)
+        return cli.run(lambda words: print(_help(cli.take_directory(words)[0])), arguments)
     return cli.run(functools.partial(_run, task, check), arguments)
 
 
 def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) -> int | None:
-    directory, arguments = _take_directory(arguments)
+    directory, arguments = cli.take_directory(arguments)
     _check_flags(arguments)
     _name_new_words(arguments)
     if not any(word.startswith("-") for word in arguments):
@@ -91,21 +91,6 @@ def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) 
     flags = [word for word in rest if word not in theirs]
     code = _run_hydra(lambda node: _job(task, swept, failures, node), [*flags, *flag, *words])
     return sweep.summarise([run.config for run in runs], failures) or code if is_sweep else code
-
-
-def _take_directory(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """Separates the directory of `--config-dir`, which holds the user's own choices, from the other words."""
-    words = list(arguments)
-    for i, word in enumerate(words):
-        flag, is_joined, value = word.partition("=")
-        if flag in ("--config-dir", "-cd"):
-            end = i + (1 if is_joined else 2)
-            given = value if is_joined else "".join(words[i + 1 : end])
-            directory = Path(given).absolute()
-            if not directory.is_dir() or end > len(words):
-                raise refuse(flag, given, "a directory with experiment/, sensor/, network/ or learner/")
-            return directory, words[:i] + words[end:]
-    return None, words
 
 
 def _check_flags(arguments: Sequence[str]) -> None:
