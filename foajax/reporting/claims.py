@@ -35,8 +35,8 @@ RULES = f"""\
   bootstrap over the seeds of both.
 - A claim *holds* if the whole interval is within the bounds of the claim. It *does not hold* if the whole interval is
   outside. Otherwise the runs *cannot tell*. A claim about two pairs has to hold for both.
-- An agent with less than {100 * LEARNED:.0f} % of the best score in the table, both above random play, has not learned
-  the game. Two such agents *cannot tell*.
+- An agent whose final score is less than {100 * LEARNED:.0f} % of the best in the table, both above random play, has not
+  learned the game. Two such agents *cannot tell*.
 - These verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. With {SEEDS}, an interval goes
   from the worst to the best seed; the true mean lies in it three times in four. Of two equal experiments, the one that
   is claimed to be better would seem so by chance in one comparison of 20.
@@ -152,10 +152,10 @@ def times_longer(slow: Sequence[RunData], fast: Sequence[RunData], axis: str) ->
     return Interval(float(value[0]), float(low), float(high))
 
 
-def _least(game: Game) -> float:
-    """Returns the score above random play from which on an agent has learned the game."""
-    best = max(np.mean([run.final_score for run in runs]) for runs in game.runs.values())
-    return LEARNED * (float(best) - chance(game.name))
+def _learned(name: str, game: Game) -> bool:
+    """Tells whether the agents of an experiment have learned the game, by their final scores."""
+    above = {each: np.mean([run.final_score for run in runs]) - chance(game.name) for each, runs in game.runs.items()}
+    return bool(above[name] >= LEARNED * max(above.values()))
 
 
 def _compare(
@@ -168,9 +168,8 @@ def _compare(
             parts.append(None)
             continue
         a, b = (measure(game.runs[name]) for name in pair)
-        above = above_chance(a, game.name), above_chance(b, game.name)
-        learned = max(each.value for each in above) >= _least(game)
-        found = over(*above) if learned else _ANYTHING
+        learned = any(_learned(name, game) for name in pair)
+        found = over(above_chance(a, game.name), above_chance(b, game.name)) if learned else _ANYTHING
         seen = f"{what}: `{pair[0]}` {a}, `{pair[1]}` {b}; {f'ratio {found}' if learned else 'neither has learned'}"
         parts.append(Part(found, min(len(game.runs[name]) for name in pair), seen))
     return parts
@@ -191,8 +190,8 @@ def _longer(slow: str, fast: str) -> Callable[[Game], list[Part | None]]:
             return [None]
         groups = game.runs[slow], game.runs[fast]
         seeds = min(map(len, groups))
-        for name, runs in zip((slow, fast), groups, strict=True):
-            if np.mean([run.score[-1] for run in runs]) - chance(game.name) < _least(game):
+        for name in (slow, fast):
+            if not _learned(name, game):
                 return [Part(_ANYTHING, seeds, f"`{name}` has not learned")]
         steps, hours = (times_longer(*groups, axis) for axis in ("env_steps", "time"))
         if steps is None or hours is None:

@@ -297,8 +297,8 @@ def _verdicts_in_words(game: Game) -> str:
     yes, no = (sum(verdict.endswith(ends) for verdict in verdicts) for ends in ((" yes", "holds"), (" no", "not hold")))
     few = any("seed" in verdict for verdict in verdicts)
     return (
-        f"Of the paper's {len(verdicts)} claims, {yes} hold on Breakout, {no} do not and "
-        f"{len(verdicts) - yes - no - missing} stay open{', as far as so few seeds can tell' if few else ''}."
+        f"Do the paper's {len(verdicts)} claims hold on Breakout? Yes for {yes}, no for {no}, open for "
+        f"{len(verdicts) - yes - no - missing}{', as far as so few seeds can tell' if few else ''}."
         + (f" Runs for {missing} are missing." if missing else "")
     )
 
