@@ -35,8 +35,8 @@ RULES = f"""\
   bootstrap over the seeds of both.
 - A claim *holds* if the whole interval is within the bounds of the claim. It *does not hold* if the whole interval is
   outside. Otherwise the runs *cannot tell*. A claim about two pairs has to hold for both.
-- An agent whose final score is less than {100 * LEARNED:.0f} % of the best in the table, both above random play, has not
-  learned the game. Two such agents *cannot tell*.
+- An agent whose final score is less than {100 * LEARNED:.0f} % of the best in the table, both above random play, has
+  not learned the game. Two such agents *cannot tell*.
 - These verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. With {SEEDS}, an interval goes
   from the worst to the best seed; the true mean lies in it three times in four. Of two equal experiments, the one that
   is claimed to be better would seem so by chance in one comparison of 20.
