@@ -319,7 +319,8 @@ CLAIMS = (
     Claim(
         "A log-polar retina scores no less than squares of as many values",
         None,
-        "Score of `logpolar` divided by that of `constant70` (1225 values each): above 0.8.",
+        "Score of `logpolar` divided by that of `constant70` (1225 values each): above 0.8. The focal point of "
+        "`logpolar` may be anywhere in the frame, that of `constant70` only where its window stays inside.",
         *(0.8, math.inf, _scores(("logpolar", "constant70"))),
     ),
 )
