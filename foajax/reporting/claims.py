@@ -299,6 +299,13 @@ CLAIMS = (
         *(-math.inf, 0.5, _scores(("constant70_p-frozen", "constant70_p"))),
     ),
     Claim(
+        "A learned gaze beats one frozen low",
+        None,
+        "Score of `constant70_p` divided by that with its gaze frozen at the lower edge of its bounds, in the middle: "
+        "above 1. A gaze frozen in the centre does not see Breakout's paddle sharply; this one does.",
+        *(1.0, math.inf, _scores(("constant70_p", "constant70_p-frozen-low"))),
+    ),
+    Claim(
         "A learned gaze beats a random one",
         None,
         "Score of `constant70_p` divided by that with a random gaze: above 1.",

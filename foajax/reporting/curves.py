@@ -45,7 +45,7 @@ PAPER_NAMES = {
     "decreasing_p": "Decreasing(P) 30-50-70",
 }
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
-_LINES = ("-", "--", ":", "-.")  # tell lines of one colour apart
+_LINES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))  # tell lines of one colour apart
 _POINTS = 300  # of a curve
 AXES = {"env_steps": (1e6, "million agent steps"), "time": (3600.0, "hours of training")}
 _LABEL_GAP = 0.085  # between labels at the lines' ends, of the axis's height
@@ -164,7 +164,7 @@ def draw_curves(
     return figure
 
 
-def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, line: dict[str, str]) -> float:
+def _draw_group(plot: Any, runs: Sequence[RunData], axis: str, unit: float, line: dict[str, Any]) -> float:
     """Draws a group; returns where its line ends."""
     mean = band(runs, axis) if len(runs) > 1 else None
     for run in runs:

@@ -48,7 +48,7 @@ def heat_of(*points):
 
 LOW, HIGH = [(44, 40)] * 9 + [(45, 41)], [(36, 40)] * 9 + [(45, 40)]
 STILL, RESTLESS = LOW, [(y, x) for y in (35, 45) for x in (35, 45)]
-CONTROLS = [f"constant70_p{what}" for what in ("-frozen", "-random", "-scripted", ", canvas")]
+CONTROLS = [f"constant70_p{what}" for what in ("-frozen", "-frozen-low", "-random", "-scripted", ", canvas")]
 NAMES = [*curves.PAPER_NAMES, *CONTROLS, "logpolar"]
 # Of each claim: who scores how much, at which pace, where it holds and where it does not; 100 at pace 1 for the others.
 BOTH_WAYS = {
@@ -73,6 +73,10 @@ BOTH_WAYS = {
     "Without gaze control it is much worse": (
         {"constant70_p-frozen": (30, 1)},
         {"constant70_p-frozen": (70, 1)},  # worse, but not much worse
+    ),
+    "A learned gaze beats one frozen low": (
+        {"constant70_p-frozen-low": (50, 1)},
+        {"constant70_p-frozen-low": (150, 1)},
     ),
     "A learned gaze beats a random one": ({"constant70_p-random": (50, 1)}, {"constant70_p-random": (150, 1)}),
     "A learned gaze beats a scripted one": ({"constant70_p-scripted": (50, 1)}, {"constant70_p-scripted": (150, 1)}),
@@ -236,7 +240,7 @@ def test_the_page_and_the_readme_of_some_runs(checkout):
     assert "| `decreasing` |  |  | not run yet |" in page and "## Pong\nNot run yet." in page
     assert "one seed suggests yes" in page and "Python 3.12.1, jax 0.11.2, a processor." in page
     assert readme.startswith("before\n<!-- results: made by x -->\nOn Breakout") and "\nold" not in readme
-    assert "2.6 times as much as a frozen one, and 0.83 of" in readme  # less 1.7 of random play
+    assert "2.6 times as much as one frozen in the centre, and\n0.83 of" in readme  # less 1.7 of random play
     assert "| gaze frozen (`constant70_p_packed-frozen`) |" in readme
     assert "| whole frame (`nonfoa`) | 6,400 | 1 | 120 [" in readme and readme.count("| gaze ") == 2
     assert "\n<!-- /results -->\nafter\n" in readme and "In these runs" not in readme
@@ -254,6 +258,14 @@ def test_the_readme_names_the_best_gaze_once_all_sensors_were_run(checkout):
         keep_run(runs, ["game=breakout", f"experiment={name}_packed"], mean)
     block = results.block(results.by_game(kept.runs(runs)), [])
     assert "`constant50_sub2` scores best: 0.92 of the whole frame, from 625 values." in block  # 108.3 of 118.3
+
+
+def test_the_readme_compares_with_a_gaze_frozen_low_too(checkout):
+    words = ["game=breakout", "experiment=constant70_p_packed", "gaze=frozen", "gaze.start=[45,40]"]
+    keep_run(checkout / "results/runs", [*words, "name=constant70_p_packed-frozen-low"], 50)
+    block = results.block(results.by_game(kept.runs(checkout / "results/runs")), [])
+    assert "one frozen in the centre, 2.0 times\nas much as one frozen low, and" in block  # 98.3 over 48.3
+    assert "| gaze frozen low (`constant70_p_packed-frozen-low`) |" in block
 
 
 def test_without_runs_the_readme_says_so():
