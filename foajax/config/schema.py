@@ -97,7 +97,8 @@ class LogPolarSensor(Section):
     fovea: float = Field(3.0, gt=0, description="Radius of the innermost ring, a disc, in frame pixels.")
     radius: float = Field(40.0, gt=0, le=10_000, description="Radius of the outermost ring, in frame pixels.")
     sampling: Literal["area", "bilinear"] = Field(
-        "area", description="Value of a wedge: the mean of its area, or one sample at its centre (bilinear)."
+        "area",
+        description="Value of a wedge: the mean of 32x32 points of its area, or one sample at its centre (bilinear).",
     )
 
     def check(self) -> None:
@@ -487,7 +488,7 @@ class Config(Section):
         height, width = self.env.frame_shape
         frame = f"env.frame_shape={height}x{width}"
         if self.sensor.window is not None:
-            check_window(self, self.sensor.window)
+            check_window(self, self.sensor)
         grid = getattr(self.sensor, "peripheral", None) or (1, 1)
         if grid[0] > height or grid[1] > width:
             raise refuse("sensor.peripheral", grid, f"a grid no finer than {frame}")
@@ -561,13 +562,20 @@ def game_name(game: str) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", found[1]).lower() if found else game
 
 
-def check_window(config: Config, window: tuple[int, int]) -> None:
-    """Raises `ConfigError` unless the sensor's focal area fits into the frame and the gaze can move it."""
+def check_window(config: Config, sensor: Any) -> None:
+    """Raises `ConfigError` unless the sensor's focal area fits into the frame and the gaze can move it.
+
+    `sensor` is the one of `config` or, where that is `OwnSensor`, the `Sensor` that was made.
+    """
     (height, width), key = config.env.frame_shape, config.sensor.size_key
     frame, bounds = f"env.frame_shape={height}x{width}", config.gaze.bounds
+    window, finest = sensor.window, sensor.finest
     if (bounds == "window" or not config.sensor.may_overhang) and (window[0] > height or window[1] > width):
         raise refuse(key, window, f"a focal area inside {frame}")
-    if config.gaze.mode in ("learned", "random") and bounds == "window" and window == (height, width):
+    if bounds == "fovea" and (finest[0] > height or finest[1] > width):
+        raise refuse("gaze.bounds", bounds, "point", why=f"the finest part of {key}, {list(finest)}, exceeds {frame}")
+    kept_inside = {"window": window, "fovea": finest}.get(bounds)
+    if config.gaze.mode in ("learned", "random") and kept_inside == (height, width):
         why = f"the focal area of {key} fills {frame} and cannot move"
         raise refuse("gaze.bounds", bounds, "point, or gaze=none", why=why)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, Num, PRNGKeyArray, UInt8
 
 from foajax.config.parse import refuse
-from foajax.config.schema import Config, check_window
+from foajax.config.schema import Config, OwnSensor, check_window
 from foajax.learning.losses import log_prob
 from foajax.networks import network as networks
 from foajax.networks.cores import Carry
@@ -48,7 +48,7 @@ class Agent:
     crop_top: int | None
 
     def __post_init__(self) -> None:
-        check_window(self.config, self.sensor.window)
+        check_window(self.config, self.sensor)
 
     @property
     def sensor(self) -> Sensor:
@@ -177,7 +177,8 @@ class Agent:
         Without normalisation and crop it reads only what the sensor looks at: then the cost of a decision does not grow
         with the frame. (A peripheral grid of means looks at all of it.) The statistics' parts are zeros then.
         """
-        if self.config.network.normalization == "none" and self.crop_top is None:
+        own = isinstance(self.config.sensor, OwnSensor)  # which may not scale with the frame
+        if self.config.network.normalization == "none" and self.crop_top is None and not own:
             self.check(screen)
             none = jnp.zeros(screen.shape[0])
             roi = self.sense(jnp.asarray(screen), focal_point)

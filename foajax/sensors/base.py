@@ -24,6 +24,7 @@ class Sensor(Protocol):
     The focal point is (y, x) in frame pixels, int32. An area of h x w pixels around it covers rows y - h//2 to
     y - h//2 + h - 1, and columns likewise: 70 rows at y = 40 are rows 5 to 74. What is hidden, or outside the frame, is
     0. Training normalises frames before they are sensed, so that 0 is what never changes. Values are not rescaled.
+    In other programs frames may be uint8: cast them before you subtract.
 
     Attributes:
       window: height and width of the focal area, frame pixels.

@@ -172,4 +172,4 @@ def _check(gaze: Any, sensor: Any, frame_shape: tuple[int, int]) -> None:
     still = replace(gaze, mode="frozen")
     known = sensor if isinstance(sensor, SensorConfig) else OwnSensor(kind=f"own:{type(sensor).__name__}")
     env = EnvConfig(frame_shape=frame_shape)
-    check_window(Config(name="wrapper", sensor=known, gaze=still, env=env), sensor.window)
+    check_window(Config(name="wrapper", sensor=known, gaze=still, env=env), sensor)

@@ -52,8 +52,8 @@ class LogPolar(Sensor):
         """Senses a window of the frame; inner rings come first, values are not rescaled.
 
         'bilinear' samples each cell's centre, between four pixels: sharp, but a cell larger than a few
-        pixels misses what lies between the centres. 'area' takes the mean over each cell's area, which
-        does not alias; cells smaller than a pixel show the pixels under them.
+        pixels misses what lies between the centres. 'area' takes the mean over each cell's area, at 32 x 32
+        points: up to about as many pixels it does not alias. Cells smaller than a pixel show the pixels under them.
         """
         pixels = window.astype(jnp.float32).reshape(-1)
         cells = [(pixels[index] * weight).sum(1) for index, weight in _tables(self.config)]

@@ -31,8 +31,9 @@ def check(config: Config) -> None:
       ConfigError: no gaze and a focal area that is not the whole frame; no such game, torso, core or
         logger; no agent to begin with.
     """
-    window, frame = make_sensor(config.sensor).window, config.env.frame_shape
-    check_window(config, window)
+    sensor, frame = make_sensor(config.sensor), config.env.frame_shape
+    check_window(config, sensor)
+    window = sensor.window
     if config.gaze.mode == "none" and window != frame:
         why = f"the focal area is {window[0]}x{window[1]}, not the whole frame, {frame[0]}x{frame[1]}"
         raise refuse("gaze.mode", "none", "learned, frozen, random or scripted", why=why)

@@ -260,6 +260,17 @@ def test_a_window_larger_than_the_frame_needs_a_gaze_that_bounds_the_point_alone
     assert from_mapping(wide).sensor.window == (120, 120)
 
 
+def test_bounds_fovea_need_a_finest_part_inside_the_frame_that_can_move():
+    wide = changed(LOG_POLAR, ("sensor", "radius"), 60.0)
+    wide["gaze"]["bounds"] = "fovea"
+    assert from_mapping(wide).sensor.finest == (6, 6)
+    wide["sensor"]["fovea"] = 45.0
+    assert error(wide).startswith("gaze.bounds=fovea: the finest part of sensor.radius, [90, 90], exceeds")
+    full = changed(RINGS, ("gaze", "bounds"), "fovea")
+    full["sensor"]["rings"] = [[80, 80, 1]]
+    assert error(full).startswith("gaze.bounds=fovea: the focal area of sensor.rings fills")
+
+
 @pytest.mark.parametrize("config", [RINGS, LOG_POLAR], ids=lambda config: config.name)
 def test_to_mapping_is_plain_and_the_inverse_of_from_mapping(config):
     mapping = json.loads(json.dumps(to_mapping(config)))

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset
 
 from foajax.config.parse import ConfigError
-from foajax.config.schema import GazeConfig, RingSensor
+from foajax.config.schema import GazeConfig, LogPolarSensor, RingSensor
 from foajax.sensors.wrappers import FoveatedObservation, FoveatedVectorObservation
 
 FULL = RingSensor(rings=((6, 6, 1),), layout="packed")
@@ -160,6 +160,7 @@ def test_what_shows_no_pixels_is_refused(space):
         ("constant70", None, r"sensor\.rings=\[70, 70\].*16x20"),
         ("constant71", None, "experiment=constant71.*constant70"),
         (FULL, GazeConfig(start=(16, 3)), r"gaze\.start.*\[16, 3\].*16x20"),
+        (LogPolarSensor(fovea=9, radius=20), GazeConfig(bounds="fovea"), r"gaze\.bounds=fovea.*\[18, 18\].*16x20"),
         (FULL, GazeConfig(mode="frozen"), "gaze.mode=frozen.*learned"),
     ],
 )
