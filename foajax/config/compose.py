@@ -40,13 +40,18 @@ def compose(overrides: Sequence[str] = (), config_dir: str | Path | None = None)
       config_dir: a directory with choices of your own, in experiment/, sensor/, gaze/, network/, learner/.
 
     Raises:
-      ConfigError: a word is not `key=value`, a key or choice is unknown, or a value has the wrong type or range.
+      ConfigError: a word is not `key=value`, a key or choice is unknown, or a value has the wrong type or range; there
+        is no such directory.
     """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
+    if isinstance(overrides, str):
+        raise refuse("overrides", overrides, 'a list of words, such as ["experiment=nonfoa"]')
+    if config_dir is not None and not Path(config_dir).is_dir():
+        raise refuse("config_dir", config_dir, "a directory")
     words = [checked(word, sweep=False, config_dir=config_dir) for word in overrides]
     place = "" if config_dir is None else str(Path(config_dir).absolute()).replace("'", "\\'")
     more = [f"hydra.searchpath=['file://{place}']"] if place else []

@@ -402,7 +402,9 @@ class TrainConfig(Section):
     """How long a run trains, what it starts from, and what it writes."""
 
     prefix: ClassVar[str] = "train."
-    env_steps: int = Field(5_000_000, ge=1, description="Decisions, of all environments together, to train for.")
+    env_steps: int = Field(
+        5_000_000, ge=1, description="Decisions, of all environments together, after which the last rollout ends."
+    )
     init_from: str | None = Field(
         None, description="Run or agent whose parameters and frame statistics a new run begins with."
     )

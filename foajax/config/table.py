@@ -13,7 +13,8 @@ from foajax.config.parse import ABSENT, Section, describe, kinds, resolve, schem
 
 _PAGE = """# Keys
 
-Every key of a run, with its default; *required* has none. Set a key on the command line: `foajax train gaze.step=8`.
+Every key of a run, with its default. The experiment sets what is *required*: `constant70` if you name none. Set a key
+on the command line: `foajax train gaze.step=8`.
 
 A choice of a group, such as `learner=paper` or `experiment=seek`, sets several keys at once. `foajax train --help`
 lists the choices; `foajax train experiment=seek --cfg job` prints the values of all keys.

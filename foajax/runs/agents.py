@@ -98,7 +98,7 @@ class TrainedAgent:
           An `Actions`: `natural`, `vision` and `focal_point`.
 
         Raises:
-          ValueError: the frames have another type, shape or number.
+          ValueError: the frames have another type, shape or number; rewards or starts another shape.
           RuntimeError: the process was forked from one that had started JAX.
         """
         refuse_fork()
@@ -107,10 +107,15 @@ class TrainedAgent:
         batch = len(self._starts)
         if len(frames) != batch:
             raise ValueError(f"frames={list(frames.shape)}: accepted is [{batch}, ...], as reset({batch}) was told")
+        reward = np.zeros(batch, np.float32) if rewards is None else np.asarray(rewards, np.float32)
+        begin = np.zeros(batch, bool) if starts is None else np.asarray(starts, bool)
+        for name, given in (("rewards", reward), ("starts", begin)):
+            if given.shape != (batch,):
+                raise ValueError(f"{name}={list(given.shape)}: accepted is [{batch}], one for each frame")
         timestep = TimeStep(
             frame=np.asarray(frames),
-            reward=np.zeros(batch, np.float32) if rewards is None else np.asarray(rewards, np.float32),
-            is_first=self._starts if starts is None else self._starts | np.asarray(starts, bool),
+            reward=reward,
+            is_first=self._starts | begin,
             is_terminal=np.zeros(batch, bool),
         )
         output, _, self._state = self._act(self.params, self.statistics, self._state, timestep, next(self._keys))

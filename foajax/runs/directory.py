@@ -217,7 +217,7 @@ def check_same_run(path: Path, config: Config) -> None:
     if keys := [key for key in differing(asked, stored) if key not in free]:
         old, new = _show(stored.get(keys[0])), _show(asked.get(keys[0]))
         still = FREE if stored["learner.schedule"] == "constant" else ()
-        words = shlex.join(_word(key, stored[key]) for key in keys if key in stored and key not in still)
+        words = shlex.join(w for key in keys if key in stored and key not in still for w in _words(key, stored[key]))
         remedy = f"choose another run=<dir>, or {f'go on with {words}' if words else f'leave out {keys[0]}'}"
         if keys[0] == "train.env_steps":
             remedy = f"its learning rate falls to 0 there; accepted is another run=<dir> with train.init_from={path}"
@@ -230,10 +230,11 @@ def _has_begun(path: Path) -> bool:
     return (rows.is_file() and rows.stat().st_size > 0) or (checkpoints.is_dir() and any(checkpoints.iterdir()))
 
 
-def _word(key: str, value: Any) -> str:
+def _words(key: str, value: Any) -> list[str]:
     """Writes a key and its value as one types them. `sensor=rings` brings the keys of its kind, `sensor.kind` none."""
-    is_group = key == "sensor.kind" and ":" not in value
-    return f"{'sensor' if is_group else key}={_show(value)}"
+    if key != "sensor.kind":
+        return [f"{key}={_show(value)}"]
+    return ["sensor=own", f"sensor.kind={value}"] if ":" in value else [f"sensor={value}"]
 
 
 def _show(value: Any) -> str:

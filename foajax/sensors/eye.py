@@ -47,9 +47,10 @@ class Seeing:
             return cls(sensor, shapes, ring_count(sensor, frame_shape).actual)
         if isinstance(sensor, LogPolarSensor):
             return cls(sensor, ((sensor.rings, sensor.wedges),), sensor.rings * sensor.wedges)
-        from foajax.sensors.registry import make_sensor
+        from foajax.sensors.registry import check_images, make_sensor
 
         made = make_sensor(sensor)
+        check_images(made, frame_shape)
         return cls(made, made.image_shapes(frame_shape), made.count(frame_shape).actual)
 
     def look(self, frames: np.ndarray, focal_points: np.ndarray, bounds: str) -> Images:

@@ -6,10 +6,14 @@ import functools
 import json
 from typing import Any
 
+import jax
+import numpy as np
+
 from foajax.config.parse import refuse
 from foajax.config.parts import make_part
 from foajax.config.schema import LogPolarSensor, OwnSensor, RingSensor, SensorConfig
 from foajax.sensors.base import Sensor
+from foajax.sensors.geometry import Shape
 from foajax.sensors.logpolar import LogPolar
 from foajax.sensors.rings import Rings
 
@@ -30,6 +34,17 @@ def make_sensor(sensor: SensorConfig | Sensor) -> Sensor:
     if not isinstance(sensor, Sensor):
         raise refuse("sensor", sensor, "a RingSensor, LogPolarSensor or foajax.Sensor; in wrappers an experiment too")
     return sensor
+
+
+def check_images(sensor: Sensor, frame_shape: Shape) -> None:
+    """Raises `ConfigError` unless a sensor of one's own gives the images that it says."""
+    frame, point = jax.ShapeDtypeStruct(frame_shape, np.float32), jax.ShapeDtypeStruct((2,), np.int32)
+    said = [f"float32{list(shape)}" for shape in sensor.image_shapes(frame_shape) or ()]
+    given = jax.eval_shape(functools.partial(sensor.sense, bounds="point"), frame, point)
+    seen = [f"{image.dtype}{list(image.shape)}" for image in given] if isinstance(given, tuple) else ["no tuple"]
+    if not said or seen != said:
+        why = f"its sense gives {', '.join(seen)} of a frame {list(frame_shape)}"
+        raise refuse("sensor", type(sensor).__name__, f"what its image_shapes says: {', '.join(said) or None}", why=why)
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from foajax.config.parse import refuse
-from foajax.config.schema import Config, check_window
+from foajax.config.schema import Config, OwnSensor, check_window
 from foajax.envs.atari import check_game
 from foajax.envs.make import make_environments
 from foajax.launch import processes
@@ -19,7 +19,7 @@ from foajax.runs.directory import open_run
 from foajax.runs.row_logger import find_logger
 from foajax.runs.status import newest_checkpoint
 from foajax.runtime import use_compilation_cache
-from foajax.sensors.registry import make_sensor
+from foajax.sensors.registry import check_images, make_sensor
 from foajax.training import profiling
 from foajax.training.run import Run
 
@@ -34,6 +34,8 @@ def check(config: Config) -> None:
     sensor, frame = make_sensor(config.sensor), config.env.frame_shape
     check_window(config, sensor)
     window = sensor.window
+    if isinstance(config.sensor, OwnSensor):
+        check_images(sensor, frame)
     if config.gaze.mode == "none" and window != frame:
         why = f"the focal area is {window[0]}x{window[1]}, not the whole frame, {frame[0]}x{frame[1]}"
         raise refuse("gaze.mode", "none", "learned, frozen, random or scripted", why=why)
@@ -95,6 +97,8 @@ def train_agent(config: Config) -> TrainedAgent:
       ConfigError: the configuration cannot be run, or the directory belongs to another run.
       EnvironmentFault: an environment raised; what was learned is saved.
     """
+    if not isinstance(config, Config):
+        raise refuse("config", config, "a Config, such as foajax.compose returns")
     use_compilation_cache()
     start(config)
     return load_agent(config.run_dir, trust=True)

@@ -462,6 +462,13 @@ def test_choices_of_ones_own_stand_beside_ours(own):
         compose(["experiment=mine"])
 
 
+def test_words_in_one_string_and_a_missing_directory_are_refused():
+    with pytest.raises(ConfigError, match="^overrides=experiment=seek: accepted is a list of words"):
+        compose("experiment=seek")
+    with pytest.raises(ConfigError, match="^config_dir=/nowhere: accepted is a directory"):
+        compose(["experiment=seek"], "/nowhere")
+
+
 def test_words_of_before_in_a_file_give_way_to_the_command_lines(own):
     config = compose(["experiment=mine", "train.keep_checkpoints=2"], own)
     assert (config.train.keep_checkpoints, config.learner.num_epochs) == (2, 7)

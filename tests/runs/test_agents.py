@@ -150,3 +150,6 @@ def test_it_begins_by_itself_and_says_what_it_cannot_take(pong):
         fresh.decide(screens(0))
     with pytest.raises(ValueError, match=r"frame=uint8 \[3, 80, 80\]: accepted is uint8 \[B, 210, 160\], gray"):
         fresh.decide(np.zeros((3, 80, 80), np.uint8))
+    for more in ({"rewards": np.array(1.0)}, {"rewards": np.zeros(2)}, {"starts": np.array([True])}):
+        with pytest.raises(ValueError, match=rf"{next(iter(more))}=\[\d?\]: accepted is \[3\], one for each frame"):
+            fresh.decide(screens(0, 3), **more)

@@ -219,6 +219,12 @@ def test_another_meaning_is_refused_by_name(config, key, value, line):
     open_run(config, command=COMMAND).close()  # and nobody holds it
 
 
+def test_the_way_back_to_a_sensor_of_ones_own_names_its_group(config):
+    begun(changed(config, sensor={"kind": "mine:Dots", "kwargs": {}}))
+    words = shlex.split(refusal(config).partition("go on with ")[2])
+    assert words[-2:] == ["sensor=own", "sensor.kind=mine:Dots"]
+
+
 def test_a_key_that_the_run_has_not_is_to_be_left_out(config):
     begun(config)
     told = refusal(changed(config, network__torso_kwargs={"b": 2}))

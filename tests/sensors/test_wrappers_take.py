@@ -18,9 +18,11 @@ from gymnasium.wrappers import FrameStackObservation
 from noise import Noise
 
 import foajax
+from foajax.config.compose import compose
 from foajax.config.parse import ConfigError
 from foajax.config.schema import GazeConfig, RingSensor
 from foajax.learning.agent import _pay
+from foajax.training import start
 
 SENSOR = RingSensor(rings=((6, 6, 1), (12, 12, 2)), layout="packed")
 FULL = RingSensor(rings=((6, 6, 1),), layout="packed")
@@ -324,6 +326,24 @@ def test_a_sensor_of_ones_own_is_run_by_jax():
     for i, (y, x) in enumerate(((6, 10), (8, 12))):
         frame = env.env.envs[i].drawn
         np.testing.assert_allclose(observation["image"][i, ..., 0], crop(frame, y, x, size=2) / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shapes", [((3, 3),), ((2, 2), (2, 2)), None])
+def test_a_sensor_of_ones_own_that_gives_other_images_than_it_says_is_refused(shapes):
+    sensor = Corner()
+    sensor.image_shapes = lambda frame_shape: shapes
+    message = r"^sensor=Corner: its sense gives float32\[2, 2\] of a frame .*; accepted is what its image_shapes says"
+    with pytest.raises(ConfigError, match=message):
+        foajax.FoveatedObservation(Noise(), sensor, GAZE)
+    with pytest.raises(ConfigError, match="sensor=Liar: its sense gives"):
+        start.check(compose(["sensor=own", f"sensor.kind={__name__}:Liar"]))
+
+
+class Liar(Corner):
+    """Says that it gives larger images."""
+
+    def image_shapes(self, frame_shape):
+        return ((9, 9),)
 
 
 def _sense_with_jax(results):
