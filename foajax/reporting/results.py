@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,12 @@ _GAZES = {
     "constant70_p-frozen-low": "gaze frozen low",
     "constant70_p-random": "gaze random",
     "constant70_p-scripted": "gaze scripted",
+}
+_TIMES = {  # whose score a learned gaze has so many times
+    "constant70_p-frozen": "the score of a gaze frozen in the centre",
+    "constant70_p-frozen-low": "that of one frozen low",
+    "constant70_p-random": "that of a random one",
+    "constant70_p-scripted": "that of one that scans the lower half",
 }
 FIGURES: dict[str, tuple[str, Mapping[str, str]]] = {  # title, and whose curves by which names
     "constant": ("constant resolution (Fig. 7)", {name: name for name in PRESETS["constant"]}),
@@ -274,10 +281,14 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
     there = [label for label in _GAZES if label in game.runs]
     if there[:3] != list(_GAZES)[:3]:
         return "Not run yet.\n"
-    worth = {label: _worth(game, label).value for label in there}
-    whole, learned, frozen = (worth[label] for label in there[:3])
-    low = worth.get("constant70_p-frozen-low")
-    than_low = f", {learned / low:.1f} times\nas much as one frozen low" if low else ""
+    whole, learned, *others = (_worth(game, label).value for label in there)
+    *first, last = (
+        f"{learned / other:.2g} times {_TIMES[label]}" for label, other in zip(there[2:], others, strict=True)
+    )
+    text = (
+        f"On Breakout a learned gaze scores {learned / whole:.2f} of what an agent scores that sees the whole frame, "
+        f"from a fifth of its pixel values. It has {', '.join(first) + ' and ' if first else ''}{last}.{_best(game)}"
+    )
     rows = []
     for label in there:
         name = game.runs[label][0].config.name  # as it is typed, with `_packed`
@@ -286,9 +297,7 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
     over_what = f"over seeds{'; where there is one seed, over its games' if one else ', from the worst to the best'}"
     other = _other_learner(game)
     return (
-        f"On Breakout a learned gaze scores {learned / frozen:.1f} times as much as one frozen in the centre"
-        f"{than_low}, and\n{learned / whole:.2f} of what an agent scores that sees the whole frame. "
-        f"All gazes see a fifth\nof its pixel values.{_best(game)}\n\n"
+        f"{textwrap.fill(text, 120)}\n\n"
         "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
         f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
         f"Score: mean of 100 whole games. Brackets: 95 % intervals {over_what}.\n"
@@ -319,7 +328,7 @@ def _best(game: Game) -> str:
     config = game.runs[best][0].config
     values = make_sensor(config.sensor).count(config.env.frame_shape).nominal
     share = f"{scores[best] / whole:.2f} of the whole frame"
-    return f" Of the paper's six sensors with a gaze\n`{best}` scores best: {share}, from {values:,} values."
+    return f" Of the paper's six sensors with a gaze `{best}` scores best: {share}, from {values:,} values."
 
 
 def draw(games: Mapping[str, Game], directory: Path) -> None:
