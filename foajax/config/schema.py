@@ -403,7 +403,7 @@ class TrainConfig(Section):
 
     prefix: ClassVar[str] = "train."
     env_steps: int = Field(
-        5_000_000, ge=1, description="Decisions, of all environments together, after which the last rollout ends."
+        5_000_000, ge=1, description="Decisions of all environments together, at least: a run ends with a rollout."
     )
     init_from: str | None = Field(
         None, description="Run or agent whose parameters and frame statistics a new run begins with."

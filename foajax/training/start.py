@@ -28,8 +28,8 @@ def check(config: Config) -> None:
     """Finds mistakes that a configuration does not show by itself. A sweep checks all runs before the first one.
 
     Raises:
-      ConfigError: no gaze and a focal area that is not the whole frame; no such game, torso, core or
-        logger; no agent to begin with.
+      ConfigError: no gaze and a focal area that is not the whole frame; a sensor that gives other images than it says;
+        no such game, torso, core or logger; no agent to begin with.
     """
     sensor, frame = make_sensor(config.sensor), config.env.frame_shape
     check_window(config, sensor)
