@@ -87,9 +87,11 @@ def _heat(run: RunData) -> heatmap.HeatMap | None:
 
 
 def _check_gaze(label: str, run: RunData) -> None:
-    mode = run.config.gaze.mode
-    if label in _COMPARED and mode not in ("learned", "none") and f"-{mode}" not in label:
-        raise refuse(str(run.path), accepted=f"name={run.config.name}-{mode}", why=f"has a {mode} gaze")
+    gaze = run.config.gaze
+    kind = "frozen-low" if gaze.mode == "frozen" and gaze.start != "centre" else gaze.mode
+    if label in _COMPARED and kind not in ("learned", "none") and not label.endswith(f"-{kind}"):
+        name = f"{run.config.name.split('-')[0]}-{kind}"
+        raise refuse(str(run.path), accepted=f"name={name}", why=f"has a {kind} gaze")
 
 
 def _check_protocol(groups: Sequence[Sequence[RunData]]) -> None:

@@ -31,9 +31,9 @@ def check(config: Config) -> None:
       ConfigError: no gaze and a focal area that is not the whole frame; a sensor that gives other images than it says;
         no such game, torso, core or logger; no agent to begin with.
     """
-    sensor, frame = make_sensor(config.sensor), config.env.frame_shape
+    sensor = make_sensor(config.sensor)
+    window, frame = sensor.window, config.env.frame_shape
     check_window(config, sensor)
-    window = sensor.window
     if isinstance(config.sensor, OwnSensor):
         check_images(sensor, frame)
     if config.gaze.mode == "none" and window != frame:
