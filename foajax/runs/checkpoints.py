@@ -39,6 +39,7 @@ from foajax.runs import durable
 
 _FORMAT = 1
 _COMPLETE = re.compile(r"0|[1-9][0-9]{0,17}")
+_EMPTY = re.compile(r"[\[,]0[\],]")  # in what `_describe` says of an array without elements
 _LEFTOVER = re.compile(r"\.[0-9]+\.(new|old)")
 _HEADROOM = 2**20  # bytes beside the arrays: names, shapes, indices
 
@@ -108,7 +109,7 @@ class Checkpoints:
 
         Args:
           env_steps: the name of the checkpoint; one that exists already is left as it is.
-          state: a pytree of arrays, typed PRNG keys included; none of them empty (ValueError).
+          state: a pytree of arrays, typed PRNG keys included.
           meta: what JSON can hold (TypeError otherwise); ``meta["score"]`` decides which one is best.
 
         Returns:
@@ -119,13 +120,10 @@ class Checkpoints:
         if self._writer is not None and self._writer.is_alive():
             return False
         leaves = named_leaves(state)
-        for name, leaf in leaves.items():
-            if leaf.size == 0:
-                raise ValueError(f"{name} has no elements, which Orbax cannot store")
         spec = {name: _describe(leaf) for name, leaf in leaves.items()}
         body = {"format": _FORMAT, "env_steps": int(env_steps), "meta": dict(meta), "leaves": spec}
         text = json.dumps(body, indent=1)
-        arrays = {name: _copy(leaf) for name, leaf in leaves.items()}
+        arrays = {name: _copy(leaf) for name, leaf in leaves.items() if leaf.size}  # Orbax refuses others
         self._writer = threading.Thread(
             target=self._run, args=(self._keep, int(env_steps), arrays, text), name="checkpoint-writer"
         )
@@ -291,7 +289,8 @@ def _read(path: Path, template: Any, *, part: bool) -> Restored:
         stored = body["leaves"]
         relevant = {name: stored[name] for name in leaves if name in stored} if part else stored
         _compare(relevant, {name: _describe(leaf) for name, leaf in leaves.items()})
-        arrays = _place(_read_arrays(path / "state", list(stored)), leaves)
+        written = [name for name, spec in stored.items() if not _EMPTY.search(spec)]
+        arrays = _place(_read_arrays(path / "state", written), leaves)
         state = jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in leaves])
     except Exception as error:  # files of any content end up here, as do those of another program
         raise CheckpointError(f"checkpoint {path} cannot be used: {_one_line(error)}") from error
@@ -309,7 +308,7 @@ def _place(arrays: Mapping[str, np.ndarray], leaves: Mapping[str, Any]) -> dict[
     """Puts the arrays that `leaves` asks for where `leaves` are: on the host or a device, raw or as keys."""
     placed = {}
     for name, leaf in leaves.items():
-        array = arrays[name]
+        array = arrays[name] if leaf.size else np.empty(leaf.shape, leaf.dtype)
         if _is_key(leaf):
             array = jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(jnp.empty((), leaf.dtype)))
         # What was read decides, not what meta.json says about it.

@@ -167,9 +167,18 @@ def test_names_that_collide_are_refused(opened):
         opened().save(1, {"a/b": jnp.zeros(1), "a": {"b": jnp.ones(1)}}, {})
 
 
-def test_empty_arrays_are_refused(opened):
-    with pytest.raises(ValueError, match="a/0 has no elements"):
-        opened().save(1, {"a": [jnp.zeros((0, 3))]}, {})
+def test_arrays_without_elements_come_back(opened):
+    state = {**small(5), "empty": [jnp.zeros((32, 0)), np.zeros(0, np.int8)]}
+    with opened() as checkpoints:
+        checkpoints.save(1, state, {})
+    assert_same(opened().restore(state).state, state)
+
+
+def test_an_array_without_elements_is_not_taken_for_another(opened):
+    with opened() as checkpoints:
+        checkpoints.save(1, {**small(5), "empty": jnp.zeros((32, 0))}, {})
+    with pytest.raises(CheckpointError, match=r"empty is float32\[32,0\], expected is float32\[32,1\]"):
+        opened().restore({**small(5), "empty": jnp.zeros((32, 1))})
 
 
 def test_meta_that_json_cannot_hold_is_refused(opened):
