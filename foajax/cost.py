@@ -34,7 +34,9 @@ from foajax.runtime import wait_in_place
 
 class Options(Section):
     experiments: str | None = Field(None, description="Experiments, with commas between them; null for all.")
-    torso: Literal["nature", "a3c"] = Field("nature", description="The network's convolutions.")
+    torso: Literal["nature", "a3c"] | None = Field(
+        None, description="A choice of network= for all; null for each experiment's own."
+    )
     json_file: str | None = Field(None, alias="json", description="JSON file to write the result to.")
     color: bool = Field(False, alias="env.color", description="Frames in colour; else gray.")
     repeats: int = Field(50, ge=1, description="Repeats of each timing.")
@@ -86,9 +88,9 @@ def _exported(names: Sequence[str], options: Options) -> list[dict[str, Any]]:
 
 
 def _print(records: Sequence[dict[str, Any]]) -> None:
-    table = Table(box=box.SIMPLE, title=f"{records[0]['torso']} torso; batches of 1 | 32")
+    table = Table(box=box.SIMPLE, title="Batches of 1 | 32")
     table.add_column("experiment", no_wrap=True)
-    for heading in ("values\nnominal", "values\nshown", "torso\nkFLOP", "decision\nkFLOP", "ratio", "params"):
+    for heading in ("torso", "values\nnominal", "values\nshown", "torso\nkFLOP", "decision\nkFLOP", "ratio", "params"):
         table.add_column(heading)
     for heading in ("sense us", "network us", "decision us", "ratio"):
         table.add_column(f"{heading}\n1 | 32", no_wrap=True)
@@ -99,6 +101,7 @@ def _print(records: Sequence[dict[str, Any]]) -> None:
         ratios = " | ".join(f"{record[f'decision_us_batch{batch}_ratio']:.2f}" for batch in BATCHES)
         table.add_row(
             record["experiment"],
+            record["torso"],
             f"{record['pixels_nominal']:,}",
             f"{record['pixels_actual']:,}",
             f"{record['torso_flops'] / 1e3:,.0f}",

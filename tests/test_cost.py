@@ -122,7 +122,7 @@ def test_the_command(tmp_path, capsys):
     [
         ("experiments=nonfoa,constant71", "experiments=constant71: did you mean constant70? accepted is one of"),
         ("repeats=0", "repeats=0: accepted is an integer >= 1"),
-        ("torso=resnet", "torso=resnet: accepted is one of nature, a3c"),
+        ("torso=resnet", "torso=resnet: accepted is one of nature, a3c or null"),
         (
             "json=/nowhere/at/all.json",
             "json=/nowhere/at/all.json: accepted is a file that can be written, in a directory",
@@ -140,6 +140,15 @@ def test_without_names_all_experiments_on_frames_of_80x80_are_timed_as_exported(
     timed = command.Options(target="onnx").names
     assert "nonfoa" in timed and "search_full" not in timed
     assert set(timed) < set(command.Options().names)
+
+
+def test_an_experiment_keeps_its_own_network_unless_one_is_asked_for():
+    def torsos_of(torso):
+        found = cost.compose_each(["search_rings_p"], torso=torso, color=False)
+        return {name: config.network.torso for name, config in found.items()}
+
+    assert torsos_of(None) == {"search_rings_p": "small", "nonfoa": "nature"}
+    assert torsos_of("a3c") == {"search_rings_p": "a3c", "nonfoa": "a3c"}
 
 
 def test_a_run_of_its_own_is_measured():

@@ -35,17 +35,29 @@ class Subject(NamedTuple):
     calls: Calls  # what is timed
 
 
-def measure(experiments: Sequence[str], *, torso: str, color: bool = False, repeats: int) -> list[dict[str, Any]]:
+def compose_each(experiments: Sequence[str], *, torso: str | None, color: bool) -> dict[str, Config]:
+    """Composes each experiment, and `nonfoa` for the ratios, with its own network or with that of `torso`.
+
+    Raises:
+      ConfigError: an unknown name.
+    """
+    words = [f"env.color={color}", *([f"network={torso}"] if torso else [])]
+    return {name: compose([f"experiment={name}", *words]) for name in dict.fromkeys([*experiments, REFERENCE])}
+
+
+def measure(
+    experiments: Sequence[str], *, torso: str | None, color: bool = False, repeats: int
+) -> list[dict[str, Any]]:
     """Measures each experiment, and `nonfoa` for the ratios: counts, times in microseconds, ratios to `nonfoa`.
 
     Raises:
       ConfigError: an unknown name.
     """
-    names = list(dict.fromkeys([*experiments, REFERENCE]))
-    subjects = [_subject(compose([f"experiment={name}", f"network={torso}", f"env.color={color}"])) for name in names]
+    configs = compose_each(experiments, torso=torso, color=color)
+    subjects = list(map(_subject, configs.values()))
     times = medians([subject.calls for subject in subjects], repeats)
     records = [{**subject.exact, **taken} for subject, taken in zip(subjects, times, strict=True)]
-    reference = records[names.index(REFERENCE)]
+    reference = records[list(configs).index(REFERENCE)]
     for record in records:
         for key in ("torso_flops", "decision_flops", *(f"decision_us_batch{batch}" for batch in BATCHES)):
             record[f"{key}_ratio"] = record[key] / reference[key]

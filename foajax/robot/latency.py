@@ -22,11 +22,10 @@ import numpy as np
 import onnx.utils
 import onnxruntime
 
-from foajax.config.compose import compose
 from foajax.config.parse import refuse
 from foajax.config.schema import Config
 from foajax.learning.agent import Agent
-from foajax.reporting.cost import REFERENCE, Calls, count, take_turns
+from foajax.reporting.cost import REFERENCE, Calls, compose_each, count, take_turns
 from foajax.robot import folder
 from foajax.robot.agent import Agent as Exported
 from foajax.runs.agents import TrainedAgent
@@ -55,7 +54,7 @@ print(json.dumps({"start_s": seconds, "memory_mb": peak / 1024}))
 
 
 def measure(
-    experiments: Sequence[str], *, torso: str, color: bool = False, dtype: str, repeats: int
+    experiments: Sequence[str], *, torso: str | None, color: bool = False, dtype: str, repeats: int
 ) -> list[dict[str, Any]]:
     """Measures each experiment and `nonfoa`: times of `PARTS`, file size, memory, start, and estimates of energy.
 
@@ -65,11 +64,10 @@ def measure(
     Raises:
       ConfigError: an unknown name, or an experiment that does not look at Atari's 80x80 frames.
     """
-    names = list(dict.fromkeys([*experiments, REFERENCE]))
-    configs = [compose([f"experiment={name}", f"network={torso}", f"env.color={color}"]) for name in names]
-    records = _measure(configs, dtype, repeats)
-    reference = records[names.index(REFERENCE)]
-    for name, config, record in zip(names, configs, records, strict=True):
+    configs = compose_each(experiments, torso=torso, color=color)
+    records = _measure(list(configs.values()), dtype, repeats)
+    reference = records[list(configs).index(REFERENCE)]
+    for (name, config), record in zip(configs.items(), records, strict=True):
         flops = count(config)["decision_flops"]
         record |= {"experiment": name, "dtype": dtype, "decision_flops": flops}
         for source, size in (
