@@ -69,6 +69,8 @@ def write(
     """
     if out.exists() and not (out.is_dir() and (_is_export(out) or not any(out.iterdir()))):
         raise refuse("out", out, "a new directory, or one that export has written")
+    facts(stored)  # these two refuse what cannot be exported, before games are played
+    onnx_graph.policy(stored.agent, stored.params, {})
     recorded, origin = golden.record(stored), _provenance(stored, source, command)
     try:
         whole = out.resolve()  # `.` has neither a name nor a parent

@@ -123,6 +123,8 @@ def policy(agent: Agent, params: Params, facts: Mapping[str, str]) -> onnx.Model
     config = agent.config.network
     graph = Graph(params["params"])
     write_core = _known("network.core", config.core, CORES)
+    if config.core_kwargs:
+        raise refuse("network.core_kwargs", dict(config.core_kwargs), "{}", why="cannot be exported")
     x, order = _features(graph, config, agent.image_shapes)
     side = side_width(agent)
     if side:

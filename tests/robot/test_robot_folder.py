@@ -279,7 +279,7 @@ def test_a_sensor_from_elsewhere_is_refused(make_stored, tmp_path, monkeypatch):
     config = replace(stored.agent.config, sensor={"kind": "my_sensors:Mine"})
     agent = dataclasses.replace(stored.agent, config=config)
     with pytest.raises(ConfigError, match="sensor.kind=my_sensors:Mine: cannot be exported; accepted is one of"):
-        folder.facts(dataclasses.replace(stored, agent=agent))
+        folder.write(dataclasses.replace(stored, agent=agent), tmp_path / "robot", source="agent")
 
 
 def test_statistics_that_have_seen_nothing_are_the_frames_own(untrained):

@@ -105,6 +105,12 @@ def test_parts_from_elsewhere_are_refused(key, make_stored):
         onnx_graph.policy(dataclasses.replace(stored.agent, config=config), stored.params, {})
 
 
+def test_a_core_with_arguments_is_refused(make_stored):
+    stored = make_stored("experiment=constant70_packed", "network.core_kwargs.width=64")
+    with pytest.raises(ConfigError, match=r"network.core_kwargs=\{'width': 64\}: cannot be exported; accepted is \{\}"):
+        onnx_graph.policy(stored.agent, stored.params, {})
+
+
 def test_16_bits_halve_the_file_and_change_little(make_stored):
     stored = make_stored("experiment=constant70_p_packed", "network.dense=128", "network.lstm=128")
     model = onnx_graph.policy(stored.agent, stored.params, {})
