@@ -29,9 +29,8 @@ from foajax.config.parse import Section, refuse
 from foajax.launch import sweep
 from foajax.reporting import kept
 from foajax.runs.directory import is_run
-from foajax.runs.status import RunStatus, inspect, is_finished
-
-_WATCHED = 10  # games in which a learned gaze is watched
+from foajax.runs.status import RunStatus, inspect, is_finished, newest_checkpoint
+from foajax.viewing import heatmap
 
 
 class Options(Section):
@@ -80,20 +79,26 @@ def reproduce(arguments: Sequence[str]) -> int:
 def _play(runs: Sequence[sweep.PlannedRun], jobs: int) -> int:
     """Plays finished runs for their scores, and learned gazes for heat maps too; returns 1 if that failed, else 0."""
     commands = []
-    for run in runs:
-        where = run.config.run_dir
-        episodes, watched = kept.protocol(run.config)
-        if is_finished(run.config) and not _score(run).exists():
-            commands.append(["foajax.evaluate", f"run={where}", f"episodes={episodes}", f"json={_score(run)}"])
-        if is_finished(run.config) and watched and not Path(where, "render").exists():
-            commands.append(["foajax.render", f"run={where}", f"episodes={_WATCHED}", "video=false"])
+    for config in (run.config for run in runs if is_finished(run.config)):
+        where = Path(config.run_dir)
+        newest = newest_checkpoint(where)
+        wanted, watched = kept.wanted_score(config, newest), kept.wanted_games(config)
+        if not wanted.items() <= (_score(where) or {}).items():
+            episodes, file = wanted["episodes"], where / "score.json"
+            commands.append(["foajax.evaluate", f"run={where}", f"episodes={episodes}", f"json={file}"])
+        if watched and heatmap.of_run(where, newest, games=watched) is None:
+            commands.append(["foajax.render", f"run={where}", f"episodes={watched}", "video=false"])
     with ThreadPoolExecutor(jobs) as pool:
         codes = pool.map(lambda command: subprocess.call([sys.executable, "-m", *command]), commands)
         return max([int(code != 0) for code in codes], default=0)
 
 
-def _score(run: sweep.PlannedRun) -> Path:
-    return Path(run.config.run_dir) / "score.json"
+def _score(run: Path) -> dict[str, Any] | None:
+    """Reads what `evaluate` wrote; None where there is nothing, or only the beginning of it."""
+    try:
+        return json.loads((run / "score.json").read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def _show(planned: Sequence[tuple[str, Sequence[sweep.PlannedRun]]]) -> int:
@@ -102,7 +107,7 @@ def _show(planned: Sequence[tuple[str, Sequence[sweep.PlannedRun]]]) -> int:
         for run in runs:
             path = Path(run.config.run_dir)
             known = inspect(path) if is_run(path) else None
-            score = json.loads(_score(run).read_text()) if known and _score(run).exists() else None
+            score = _score(path)
             table.add_row(
                 about if run is runs[0] else "",
                 run.config.run_dir,

@@ -24,8 +24,9 @@ def short(tmp_path, monkeypatch):
     """One stage of two short runs of seek, in a directory of the test's."""
     lines = ["experiment=seek seed=0,1 train.env_steps=640 env.num_envs=4 train.log_every=0.1"]
     monkeypatch.setattr(reproduce, "stages", lambda plan: [{"about": "a short stage", "runs": lines}])
-    monkeypatch.setattr(reproduce.kept, "protocol", lambda config: (2, True))
-    monkeypatch.setattr(reproduce, "_WATCHED", 1)
+    score = {"policy": "sampled", "episodes": 2, "protocol": []}
+    monkeypatch.setattr(reproduce.kept, "wanted_score", lambda config, env_steps: {"env_steps": env_steps, **score})
+    monkeypatch.setattr(reproduce.kept, "wanted_games", lambda config: 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -66,6 +67,26 @@ def test_a_stage_is_trained_evaluated_and_then_left_alone(short, capsys):
     assert capsys.readouterr().out.count("finished") == 2
 
 
+def finished(path, config, steps):
+    """Makes the files of a run that was trained for so many steps."""
+    (path / "checkpoints" / str(steps)).mkdir(parents=True)
+    (path / "config.yaml").write_text(yaml.safe_dump(to_mapping(config)))
+    (path / "run.json").write_text('{"starts": []}')
+
+
+@pytest.mark.parametrize("left", ['{"env_steps": 64', '{"env_steps": 320, "policy": "sampled"}', "{}"])
+def test_games_that_were_interrupted_or_of_an_older_agent_are_played_again(short, monkeypatch, left):
+    called = []
+    monkeypatch.setattr(reproduce.subprocess, "call", lambda command: called.append(command[2]) or 0)
+    runs = sweep.expand(["experiment=seek", "seed=0", "train.env_steps=640"])
+    path = short / runs[0].config.run_dir
+    finished(path, runs[0].config, 640)
+    (path / "score.json").write_text(left)
+    (path / "render").mkdir()
+    assert reproduce._play(runs, 1) == 0
+    assert called == ["foajax.evaluate", "foajax.render"]
+
+
 @pytest.mark.parametrize(
     ("word", "said"),
     [("stage=0", "stage=0: accepted is null or an integer from 1 to 6"), ("jobs=0", "jobs=0: accepted is")],
@@ -94,9 +115,7 @@ def test_the_table_tells_a_planned_run_from_another(short, capsys):
         line = f"experiment=seek seed={seed} train.env_steps={steps} env.num_envs=4 train.log_every=0.1"
         config = compose([*line.split(), *words])
         path = short / config.run_dir
-        (path / "checkpoints" / str(steps)).mkdir(parents=True)
-        (path / "config.yaml").write_text(yaml.safe_dump(to_mapping(config)))
-        (path / "run.json").write_text('{"starts": []}')
+        finished(path, config, steps)
         (path / "score.json").write_text(json.dumps({"env_steps": 320, "mean": 1148.4, "stderr": 31.0}))
     assert cli.run(reproduce.reproduce, ["show=table"]) == 0
     shorter, other = (line for line in capsys.readouterr().out.splitlines() if "runs/seek" in line)

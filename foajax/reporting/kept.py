@@ -38,17 +38,17 @@ def keep(path: Path, name: str | None) -> Path:
     if newest < run.config.train.env_steps:
         why = f"has {newest:,} of its {run.config.train.env_steps:,} env_steps"
         raise refuse("run", path, "a finished run, or one that is given fewer train.env_steps", why=why)
-    episodes, watched = protocol(run.config)
-    wanted = {"env_steps": newest, "policy": "sampled", "episodes": episodes, "protocol": []}
+    wanted, watched = wanted_score(run.config, newest), wanted_games(run.config)
     found = {key: (run.evaluation or {}).get(key) for key in wanted}
     if found != wanted:
-        command = f"foajax evaluate run={path} episodes={episodes} json={path}/score.json"
+        command = f"foajax evaluate run={path} episodes={wanted['episodes']} json={path}/score.json"
         why = f"its score.json has {found}, not {wanted}" if run.evaluation else "has no score.json"
         raise refuse("run", path, f"what {command} writes", why=why)
-    heat = heatmap.of_run(path, newest)
+    heat = heatmap.of_run(path, newest, games=watched)
     if heat is None and watched:
-        command = f"foajax render run={path} episodes=10 video=false"
-        raise refuse("run", path, f"what {command} writes", why="has no heat map of its final policy in render/")
+        command = f"foajax render run={path} episodes={watched} video=false"
+        why = f"has no heat map of {watched} games of its final policy in render/"
+        raise refuse("run", path, f"what {command} writes", why=why)
     config = replace(run.config, run=None)
     game = Path(config.run_dir).name.removesuffix(f"-{config.name}-s{config.seed}")
     out = KEPT / game / (name or f"{config.name}-s{config.seed}")
@@ -69,11 +69,16 @@ def keep(path: Path, name: str | None) -> Path:
     return out
 
 
-def protocol(config: Config) -> tuple[int, bool]:
-    """Returns the number of episodes that a kept score averages, and whether a heat map is needed."""
-    if config.searches:  # scenes are short, and targets may be anywhere, so that a heat map says little
-        return 2000, False
-    return 100, config.gaze.mode == "learned"
+def wanted_score(config: Config, env_steps: int) -> dict[str, Any]:
+    """Returns what `score.json` of a run to be kept has to say about its games."""
+    episodes = 2000 if config.searches else 100  # scenes are short
+    return {"env_steps": env_steps, "policy": "sampled", "episodes": episodes, "protocol": []}
+
+
+def wanted_games(config: Config) -> int:
+    """Returns the number of games that the heat map of a run to be kept counts; 0 where none is needed."""
+    # Where targets may be anywhere, a heat map says little.
+    return 10 if config.gaze.mode == "learned" and not config.searches else 0
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:

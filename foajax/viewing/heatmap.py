@@ -153,12 +153,12 @@ def read(file: Path) -> HeatMap:
         raise refuse(str(file), accepted="", why="is no heat map of foajax render; remove it") from None
 
 
-def of_run(path: Path, env_steps: int) -> HeatMap | None:
-    """Reads a run's heat map, if `render` made it from whole games with sampled actions at `env_steps`."""
+def of_run(path: Path, env_steps: int, *, games: int = 1) -> HeatMap | None:
+    """Reads a run's heat map, if `render` made it from `games` or more whole games, sampled, at `env_steps`."""
     file = path / "render" / FILE
     heat = read(file) if file.exists() else None
-    said = heat and (heat.env_steps, heat.policy, heat.whole_games)
-    return heat if said == (env_steps, "sampled", True) else None
+    said = heat and (heat.env_steps, heat.policy, heat.whole_games, heat.games >= games)
+    return heat if said == (env_steps, "sampled", True, True) else None
 
 
 def draw(heat: HeatMap, title: str) -> Figure:

@@ -71,12 +71,12 @@ def run(tmp_path, monkeypatch):
     return path
 
 
-def watch(path, env_steps):
+def watch(path, env_steps, games=10):
     """Leaves a heat map, as `render` does."""
     bounds = np.array([0, 0]), np.array([4, 4])
     whose = {"env_steps": env_steps, "policy": "sampled", "whole_games": True}
     (path / "render").mkdir(exist_ok=True)
-    heatmap.save(HeatMap(np.eye(5, dtype=int), np.zeros((5, 5)), *bounds, games=2, **whose), path / "render", "seek")
+    heatmap.save(HeatMap(np.eye(5, dtype=int), np.zeros((5, 5)), *bounds, games, **whose), path / "render", "seek")
 
 
 def test_a_run_is_kept_by_game_experiment_and_seed(run):
@@ -84,15 +84,17 @@ def test_a_run_is_kept_by_game_experiment_and_seed(run):
     assert out == kept.KEPT / "seek" / "seek-s3"
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 500
     assert json.loads((out / "run.json").read_text())["command"] == "python -m foajax.train experiment=seek seed=3"
-    assert heatmap.of_run(out, 2000).games == 2
+    assert heatmap.of_run(out, 2000).games == 10
     kept.write_table(kept.runs(kept.KEPT), kept.KEPT)
     table = (kept.KEPT / "README.md").read_text()
     assert "| seek | `seek` | 3 | 281 | learned | 0.0 M | 0.0 | 9.0 ± 0.5 | [seek/seek-s3](seek/seek-s3) |" in table
 
 
-def test_a_gaze_without_a_heat_map_of_the_final_policy_is_refused(run):
-    watch(run, env_steps=1000)
-    with pytest.raises(ConfigError, match="has no heat map of its final policy in render/; .* what foajax render run="):
+@pytest.mark.parametrize("other", [{"env_steps": 1000}, {"env_steps": 2000, "games": 1}])
+def test_a_gaze_without_a_heat_map_of_the_final_policy_is_refused(run, other):
+    watch(run, **other)
+    why = "has no heat map of 10 games of its final policy in render/"
+    with pytest.raises(ConfigError, match=f"{why}; .* what foajax render run=.* episodes=10"):
         kept.keep(run, None)
 
 
