@@ -6,6 +6,7 @@ Importing Hydra and OmegaConf takes a third of a second, so only the functions t
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -29,6 +30,7 @@ from foajax.config.table import defaults, groups
 # The sections of `sensor`; each name is also a choice of `sensor=`.
 _KINDS: dict[str, type[Section]] = {"rings": RingSensor, "logpolar": LogPolarSensor, "own": OwnSensor}
 _PLANS = "plans"  # of experiments/; `foajax.reproduce` reads them, they are no group
+_NAMES = ("run", "name", "train.init_from")  # sweeps name runs like runs/pong-nonfoa-gaze=frozen-s0
 _WHOLE = "nonfoa"  # the whole frame, which has no packed layout
 
 
@@ -121,7 +123,10 @@ def parse_override(word: str) -> Any:
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:
-        raise refuse(one_line(word), accepted="key=value, or key='value' to quote it") from None
+        key, _, value = word.partition("=")
+        if key in _NAMES and re.fullmatch(r"[\w./=+-]+", value):
+            return parse_override(f"{key}='{value}'")
+        raise refuse(one_line(word), accepted="key=value, or \"key='value'\" to quote it") from None
 
 
 def from_node(node: Any, words: Collection[str] = ()) -> Config:

@@ -16,7 +16,7 @@ import yaml
 
 from foajax import cli
 from foajax.config.compose import checked, compose, list_experiments
-from foajax.config.parse import ConfigError
+from foajax.config.parse import ConfigError, flatten, to_mapping
 from foajax.config.schema import Config, HeadConfig, LogPolarSensor, RingSensor
 from foajax.launch import sweep
 from foajax.launch.launch import run
@@ -377,6 +377,12 @@ def test_what_a_sweep_chooses_names_its_runs(cwd, runs):
         for gamma in ("0.9", "0.99")
     ]
     assert [config.gaze.mode for config in runs] == ["frozen", "frozen", "random", "random"]
+
+
+@pytest.mark.parametrize("key", ["run", "name", "train.init_from"])
+def test_the_name_that_a_sweep_gives_can_be_typed(key):
+    config = compose(["experiment=seek", f"{key}=seek-gaze=frozen-train.log_every=1e-1"])
+    assert dict(flatten(to_mapping(config)))[key] == "seek-gaze=frozen-train.log_every=1e-1"
 
 
 def test_runs_of_a_sweep_may_not_share_a_directory(cwd, runs, capsys):
