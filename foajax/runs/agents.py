@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -71,6 +71,10 @@ class TrainedAgent:
         """Returns the same agent with another configuration, such as other rules of the game, but the same network."""
         return dataclasses.replace(self, agent=dataclasses.replace(self.agent, config=config))
 
+    @functools.cached_property
+    def _act(self) -> Callable[..., Any]:
+        return jax.jit(self.agent.act, static_argnames="greedy")
+
     def reset(self, batch: int = 1, *, seed: int = 0, greedy: bool = False) -> None:
         """Begins an episode for each of `batch` actors.
 
@@ -79,7 +83,7 @@ class TrainedAgent:
           seed: of the actions, which are sampled.
           greedy: whether the likeliest actions are taken instead.
         """
-        self._act = jax.jit(functools.partial(self.agent.act, greedy=greedy))
+        self._greedy = greedy
         self._state, self._starts = self.agent.initial_state(batch), np.ones(batch, bool)
         self._keys = iter(map(functools.partial(jax.random.fold_in, jax.random.key(seed)), itertools.count()))
 
@@ -118,7 +122,8 @@ class TrainedAgent:
             is_first=self._starts | begin,
             is_terminal=np.zeros(batch, bool),
         )
-        output, _, self._state = self._act(self.params, self.statistics, self._state, timestep, next(self._keys))
+        said = self.params, self.statistics, self._state, timestep, next(self._keys)
+        output, _, self._state = self._act(*said, greedy=self._greedy)
         self._starts = np.zeros(batch, bool)
         return Actions(*map(np.asarray, (output.natural_action, output.vision_action, output.focal_point)))
 
