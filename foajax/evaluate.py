@@ -20,9 +20,10 @@ from rich.table import Table
 from rich.text import Text
 
 from foajax import cli
-from foajax.config.parse import replace
+from foajax.config.parse import one_line, refuse, replace
 from foajax.config.schema import SearchConfig
 from foajax.envs.measures import summarise
+from foajax.envs.own import OWN
 from foajax.runs.agents import StoredAgent
 from foajax.viewing.games import play
 
@@ -53,6 +54,8 @@ def evaluate(arguments: Sequence[str]) -> None:
     stored = options.load()
     config = stored.agent.config
     env, scenes = ([word for word in protocol if word.startswith(part)] for part in ("env.", "search."))
+    if ignored := (env if config.game in OWN else []) + ([] if config.searches else scenes):
+        raise refuse(one_line(ignored[0]), accepted="", why=f"changes nothing in game={config.game}")
     config = replace(
         config,
         env=cli.override(config.env, env, "env", _PROTOCOL),

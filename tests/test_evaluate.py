@@ -70,6 +70,15 @@ def test_what_a_protocol_cannot_change_is_refused(capsys, word, said):
     assert capsys.readouterr().err.startswith(f"foajax: error: {said}")
 
 
+@pytest.mark.parametrize(
+    ("run", "word"),
+    [(PONG, "search.noise=5"), ("agents/search-rings_p", "env.max_episode_steps=3")],
+)
+def test_a_rule_that_changes_nothing_is_refused(capsys, run, word):
+    assert cli.run(evaluate.evaluate, [f"run={run}", word]) == 2
+    assert f"foajax: error: {word}: changes nothing in game=" in capsys.readouterr().err
+
+
 def test_who_never_serves_is_cut(breakout):
     """With whole games the agent has to serve after a lost life, which a policy that only waits never does."""
     words = ["experiment=constant50_sub2_packed", "network.dense=16", "network.lstm=16"]
