@@ -22,6 +22,7 @@ from foajax.runs.checkpoints import Checkpoints
 from foajax.runs.directory import load_config, open_run
 from foajax.train import train
 from foajax.training.run import Run
+from foajax.training.start import check
 
 
 def same(one, other):
@@ -182,6 +183,13 @@ def test_parameters_that_do_not_fit_are_refused_in_one_line(breakout, tmp_path, 
     code, _, err = command(*words, f"train.init_from={breakout[0] if source == 'breakout' else source}")
     assert code == 2 and len(err.splitlines()) == 1 and err.startswith("foajax: error: train.init_from="), err
     assert said in err
+
+
+def test_of_several_processes_only_the_first_one_looks_for_the_parameters():
+    words = ["experiment=seek", "train.init_from=nowhere"]
+    with pytest.raises(ConfigError, match="train.init_from=nowhere: does not exist"):
+        check(compose(words))
+    check(compose([*words, "distributed.coordinator=localhost:1234", "distributed.processes=2"]))
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from foajax import cli
 from foajax.config import table
@@ -142,8 +143,10 @@ def _job(task: Task, swept: Mapping[str, str] | None, failures: dict[str, str], 
     config = sweep.named(config, words, swept)
     if sweep.skip_if_finished(config):
         return
+    alone = [sys.argv[0], *words, f"name={config.name}"]  # what starts this run without the others, for its run.json
     try:
-        code = cli.run(lambda _: task(config), ())
+        with mock.patch.object(sys, "argv", alone):
+            code = cli.run(lambda _: task(config), ())
     except Exception as error:  # whatever it is, the next run starts
         code = 1
         sys.excepthook(type(error), error, error.__traceback__)

@@ -44,7 +44,8 @@ def check(config: Config) -> None:
     make_torso(config.network)
     make_core(config.network)
     source = config.train.init_from
-    if source is not None and not newest_checkpoint(Path(config.run_dir)):  # a run that goes on does not need it
+    # A run that goes on does not need it. Of several processes only the first one reads it, and maybe no other can.
+    if source is not None and not newest_checkpoint(Path(config.run_dir)) and processes.where(config) is None:
         check_source(source)
 
 

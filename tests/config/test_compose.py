@@ -379,6 +379,15 @@ def test_what_a_sweep_chooses_names_its_runs(cwd, runs):
     assert [config.gaze.mode for config in runs] == ["frozen", "frozen", "random", "random"]
 
 
+def test_each_run_of_a_sweep_knows_the_words_that_start_it_alone(cwd):
+    def task(config):
+        seen.append((compose(sys.argv[1:]), config))
+
+    seen = []
+    assert run(task, [*HERE, "experiment=seek", "gaze=frozen,random", "seed=0"]) == 0
+    assert len(seen) == 2 and all(alone == config for alone, config in seen)
+
+
 @pytest.mark.parametrize("key", ["run", "name", "train.init_from"])
 def test_the_name_that_a_sweep_gives_can_be_typed(key):
     config = compose(["experiment=seek", f"{key}=seek-gaze=frozen-train.log_every=1e-1"])
