@@ -142,12 +142,12 @@ def run(command: Callable[[Sequence[str]], int | None], arguments: Sequence[str]
     return 2
 
 
-def make_directory(out: str | Path) -> Path:
-    """Creates the directory for results; raises `ConfigError` if it cannot be written."""
+def make_directory(out: str | Path, key: str = "out") -> Path:
+    """Creates the directory for results that `key` names; raises `ConfigError` if it cannot be written."""
     try:
         Path(out).mkdir(parents=True, exist_ok=True)
         if not os.access(out, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
-        raise refuse("out", out, f"a directory that can be written ({error.strerror})") from None
+        raise refuse(key, out, f"a directory that can be written ({error.strerror})") from None
     return Path(out)

@@ -189,7 +189,9 @@ def test_of_several_processes_only_the_first_one_looks_for_the_parameters():
     words = ["experiment=seek", "train.init_from=nowhere"]
     with pytest.raises(ConfigError, match="train.init_from=nowhere: does not exist"):
         check(compose(words))
-    check(compose([*words, "distributed.coordinator=localhost:1234", "distributed.processes=2"]))
+    check(
+        compose([*words, "distributed.coordinator=localhost:1234", "distributed.processes=2", "distributed.process=1"])
+    )
 
 
 @pytest.mark.slow
@@ -276,6 +278,12 @@ def test_a_profile_is_of_one_device(tmp_path):
     config = compose([*TINY, "profile=true", "train.devices=2", f"run={tmp_path}"])
     with pytest.raises(ConfigError, match="profile=true: accepted is train.devices=1 and a single process"):
         train(config)
+
+
+def test_a_profile_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path, command):
+    (tmp_path / "file").write_text("")
+    code, _, err = command("game=seek", *TINY, "profile=true", f"run={tmp_path / 'file'}")
+    assert code == 2 and err.startswith(f"foajax: error: run={tmp_path / 'file' / 'profile'}: accepted is a directory")
 
 
 @pytest.mark.slow

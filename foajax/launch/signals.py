@@ -49,7 +49,7 @@ def interrupt_ends() -> Iterator[None]:
 
 
 class StopRequest:
-    """Turns the signals of `STOPS` into a flag; a second SIGINT interrupts at once.
+    """Turns the signals of `STOPS` into a flag; a second SIGINT interrupts the rollout too.
 
     Outside the main thread it hears of no signal. After its `with`, the former handlers are back.
     """

@@ -182,5 +182,7 @@ def _trim(path: Path, start_env_steps: int) -> float:
         durable.replace(old, (old.read_bytes() if old.exists() else b"") + content)
         path.unlink()
     elif b"".join(kept) != content:
+        then = path.stat()
         durable.replace(path, b"".join(kept))
+        os.utime(path, ns=(then.st_atime_ns, then.st_mtime_ns))  # newer, `status` would take the rows for this start's
     return seconds

@@ -6,6 +6,7 @@ import contextlib
 import sys
 from pathlib import Path
 
+from foajax import cli
 from foajax.config.parse import refuse
 from foajax.config.schema import Config, OwnSensor, check_window
 from foajax.envs.atari import check_game
@@ -61,10 +62,11 @@ def start(config: Config) -> None:
         if config.profile:
             if config.train.devices > 1 or processes.where(config):
                 raise refuse("profile", True, "train.devices=1 and a single process")
+            directory = cli.make_directory(Path(config.run_dir) / "profile", "run")
             environments = make_environments(config, 0)
             for environment in environments:
                 resources.callback(environment.close)
-            profiling.profile(config, environments, f"{config.run_dir}/profile")
+            profiling.profile(config, environments, str(directory))
             return
         job = processes.start(config)
         job.agree(config)
@@ -88,7 +90,7 @@ def train_agent(config: Config) -> TrainedAgent:
     """Trains an agent in this process, or resumes its training, and returns it as its newest checkpoint has it.
 
     As `foajax train` does, it writes to `config.run_dir`, prints progress and caches compiled programs. You may call it
-    from any thread. In the main thread, SIGINT, SIGTERM and SIGUSR1 save the run and end the call early. An environment
+    from any thread. In the main thread, SIGINT, SIGTERM, SIGUSR1 and SIGHUP save the run and end the call early. An environment
     that hangs for longer than `env.timeout` seconds ends the process.
 
     Args:

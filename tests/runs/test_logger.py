@@ -121,8 +121,10 @@ WHOLE = ['{"env_steps": 100, "time": 1.0}\n', '{"env_steps": 200, "time": 2.0, "
 def test_a_start_keeps_whole_rows_up_to_it(tmp_path, content, kept):
     file = tmp_path / "metrics.jsonl"
     file.write_text(content)
+    os.utime(file, (1e9, 1e9))
     before = file.stat().st_ino
     with start(tmp_path, 200) as log:
+        assert file.stat().st_mtime == 1e9
         assert file.read_text() == "".join(WHOLE[:kept])
         assert (file.stat().st_ino == before) == (content == "".join(WHOLE[:kept]))  # replaced only at need
         log.write({"env_steps": 300})
