@@ -12,6 +12,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 
 from foajax.config.parse import refuse, suggest
+from foajax.config.parts import bind_part
 from foajax.config.schema import Config, game_name
 from foajax.envs.own import OWN
 from foajax.types import SCREEN_SHAPE
@@ -50,11 +51,13 @@ def envpool_id(name: str) -> str:
 
 
 def check_game(config: Config) -> None:
-    """Raises `ConfigError` if there is no such Atari game or `env` does not suit it. Others are checked when made."""
+    """Raises `ConfigError` if there is no such game or `env` does not suit it. Gymnasium's are checked when made."""
     if config.env.kwargs and not (is_own(config) or config.game.startswith("gymnasium:")):
         raise refuse("env.kwargs", config.env.kwargs, f"{{}} for game={config.game}")
     if config.env.color and config.game in OWN:
         raise refuse("env.color", True, f"false for game={config.game}, whose frames are gray")
+    if is_own(config):
+        bind_part("game", config.game, {}, **config.env.kwargs, num_envs=1, seed=0)
     if is_atari(config):
         atari_game(config)
 

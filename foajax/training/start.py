@@ -90,8 +90,8 @@ def train_agent(config: Config) -> TrainedAgent:
     """Trains an agent in this process, or resumes its training, and returns it as its newest checkpoint has it.
 
     As `foajax train` does, it writes to `config.run_dir`, prints progress and caches compiled programs. You may call it
-    from any thread. In the main thread, SIGINT, SIGTERM, SIGUSR1 and SIGHUP save the run and end the call early. An environment
-    that hangs for longer than `env.timeout` seconds ends the process.
+    from any thread. In the main thread, SIGINT, SIGTERM, SIGUSR1 and SIGHUP save the run and end the call early. An
+    environment that hangs for longer than `env.timeout` seconds ends the process.
 
     Args:
       config: what `foajax.compose` returns.

@@ -83,6 +83,12 @@ def test_what_cannot_be_made_is_one_line(words, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("words", [["game=test_own:no"], ["game=test_own:seek_of", "env.kwargs.color=1"]])
+def test_a_mistake_in_ones_own_is_found_before_anything_is_made(words):
+    with pytest.raises(ConfigError, match="game=test_own:"):
+        check_game(own(*words))
+
+
 def test_names_of_code_are_told_from_ours():
     names = ["breakout", "seek", "probe:gaze", "gymnasium:foajax-shades-v0", "gymnasium:ale_py:ALE/Pong-v5"]
     config = own()
