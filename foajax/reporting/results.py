@@ -87,10 +87,14 @@ def _heat(run: RunData) -> heatmap.HeatMap | None:
 
 
 def _check_gaze(label: str, run: RunData) -> None:
-    gaze = run.config.gaze
-    kind = "frozen-low" if gaze.mode == "frozen" and gaze.start != "centre" else gaze.mode
-    if label in _COMPARED and kind not in ("learned", "none") and not label.endswith(f"-{kind}"):
-        name = f"{run.config.name.split('-')[0]}-{kind}"
+    """Raises `ConfigError` if the gaze of a run that is compared is another than the end of its name says."""
+    kind = run.config.gaze.mode
+    if kind == "frozen" and run.config.gaze.start != "centre":
+        lowest, middle = heatmap.bounds(run.config)[1][0], run.config.env.frame_shape[1] // 2
+        kind = "frozen-low" if run.config.gaze.start == (lowest, middle) else "frozen-elsewhere"
+    end = "" if kind in ("learned", "none") else f"-{kind}"
+    if label in _COMPARED and end != "".join(label.partition("-")[1:]):
+        name = f"{run.config.name.partition('-')[0]}{end}"
         raise refuse(str(run.path), accepted=f"name={name}", why=f"has a {kind} gaze")
 
 
@@ -233,7 +237,7 @@ def _game(game: Game, costs: Sequence[Mapping[str, Any]]) -> str:
 _COLUMNS = ["agent", "pixel values", "seeds", "score", "of `nonfoa`", "MFLOP", "ms alone", "ms of 32", "core hours"]
 _SCORES = """\
 - **score**: mean of 100 games, in brackets its 95 % interval by bootstrap over seeds, or over the games where there
-  is one seed. With three seeds it goes from the worst to the best.
+  is one seed. Of two or three seeds it goes from the worst to the best.
 - **of `nonfoa`**: ratio of the scores, each less that of random play.
 - **MFLOP, ms alone, ms of 32**: arithmetic of one decision, and its time on a CPU, alone and as one of 32 at once
   ([cost.json](../results/bench/cost.json)).
@@ -295,15 +299,17 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
     for label in there:
         name = game.runs[label][0].config.name  # as it is typed, with `_packed`
         rows.append([f"{_GAZES[label]} (`{name}`)", *_row(game, label, costs)[1:5]])
-    one = any(len(game.runs[label]) == 1 for label in there)
-    over_what = f"over seeds{'; where there is one seed, over its games' if one else ', from the worst to the best'}"
     other = _other_learner(game)
+    legend = (
+        "Score: mean of 100 whole games. Brackets: 95 % intervals over the games where there is one seed; from the "
+        "worst to the best of two or three seeds. Ratios are of scores above random play."
+        f"{other and f' In these runs {other}'}"
+    )
     return (
         f"{textwrap.fill(text, 120)}\n\n"
         "![A learned gaze, gazes that do not learn, and the whole frame](docs/results/breakout-gaze.png)\n\n"
         f"{table(['agent', *_COLUMNS[1:5]], rows)}\n\n"
-        f"Score: mean of 100 whole games. Brackets: 95 % intervals {over_what}.\n"
-        f"Ratios are of scores above random play.{other and f' In these runs {other}'}\n\n"
+        f"{textwrap.fill(legend, 120)}\n\n"
         f"{_verdicts_in_words(game)} [All results](docs/results.md).\n"
     )
 

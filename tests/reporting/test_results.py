@@ -295,6 +295,11 @@ def test_a_run_that_is_not_compared_has_no_ratio_and_no_word_on_the_learner(chec
         (["name=constant70_p_packed"], 0, "is of 1,000 env_steps; accepted is 3,000,000"),
         (["gaze=random", "name=decreasing_packed"], 0, "has a random gaze; accepted is name=decreasing_packed-random"),
         (["gaze=frozen", "name=constant70_p_packed-frozen-low"], 0, "a frozen gaze; .*constant70_p_packed-frozen$"),
+        (["name=constant70_p_packed-frozen-low"], 0, "a learned gaze; accepted is name=constant70_p_packed$"),
+        (
+            ["gaze=frozen", "gaze.start=[35,40]", "name=constant70_p_packed-frozen-low"],
+            *(0, "has a frozen-elsewhere gaze"),
+        ),
     ],
 )
 def test_seeds_of_one_name_are_of_one_kind(checkout, words, seed, message):
@@ -337,5 +342,5 @@ def test_the_readme_says_where_the_learner_was_not_todays(checkout):
     for path in (checkout / "results/runs/breakout").iterdir():
         config = path / "config.yaml"
         config.write_text(config.read_text().replace("normalize_advantages: false", "normalize_advantages: true"))
-    block = results.block(results.by_game(kept.runs(checkout / "results/runs")), [])
-    assert "In these runs the learner was today's default with `learner.normalize_advantages=true`.\n" in block
+    block = " ".join(results.block(results.by_game(kept.runs(checkout / "results/runs")), []).split())
+    assert "In these runs the learner was today's default with `learner.normalize_advantages=true`. " in block
