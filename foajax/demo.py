@@ -89,9 +89,10 @@ def demo(arguments: Sequence[str]) -> None:
     if config.searches:
         draw_scanpath(recording).save(directory / "scanpath.png")
     ended = "The game was over" if recording.is_over else "The demo stopped"
-    score = load_score(path)
+    decisions = len(recording.score) - recording.is_over  # nothing follows from the last row's
+    score = None if config.searches else load_score(path)  # which is over scenes of all sizes
     usual = f" Its mean over {score['episodes']} games: {score['mean']:.1f}." if score else ""
-    print(f"{ended} after {len(recording.score):,} decisions. Score: {recording.score[-1]:g}.{usual}")
+    print(f"{ended} after {decisions:,} decisions. Score: {recording.score[-1]:g}.{usual}")
     print(f"Watch it: {page}\n{_LOOK_AT}")
     if config.searches:
         print(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import jax
 import numpy as np
@@ -56,6 +57,14 @@ def test_it_plays_and_says_what_to_look_at(shipped, tmp_path, capsys, monkeypatc
     assert "The demo stopped after 40 decisions. Score: " in said and "Its mean over 30 games: 9.0." in said
     assert f"Watch it: {page.as_uri()}\nWhat to look at:\n" in said and page.stat().st_size > 50_000
     assert opened == [page.as_uri()]
+
+
+def test_a_search_is_told_by_the_decisions_that_had_an_effect(tmp_path, capsys):
+    assert cli.run(demo.demo, ["game=search", f"out={tmp_path / 'out'}"]) == 0
+    said, bars = capsys.readouterr()
+    decisions, score = re.search(r"was over after (\d+) decisions. Score: (\S+)\.\n", said).groups()
+    assert float(score) == pytest.approx(1 - 0.01 * int(decisions))  # a right answer earns 1, each decision costs 0.01
+    assert "game 0" in bars and "game 0" not in said
 
 
 def test_an_agent_is_played_by_its_name(shipped, tmp_path, capsys):

@@ -37,7 +37,7 @@ RULES = f"""\
   outside. Otherwise the runs *cannot tell*. A claim about two pairs has to hold for both.
 - An agent whose final score is less than {100 * LEARNED:.0f} % of the best in the table, both above random play, has
   not learned the game. Two such agents *cannot tell*; for how much longer learning takes, one is enough.
-- These verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. Of two or three seeds, an interval
+- Verdicts need {SEEDS} seeds of each experiment; fewer seeds only *suggest* one. Of two or three seeds, an interval
   goes from the worst to the best; the true mean lies in it one time in two, or three times in four. If two experiments
   of {SEEDS} seeds are equal, the one that is claimed to be better seems so by chance in one comparison of 20.
 - *{NOT_RUN.capitalize()}* means that a run which the claim needs is missing."""

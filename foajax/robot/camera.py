@@ -213,6 +213,7 @@ def main(words: list[str] | None = None) -> int:
 
 def _function(name: str) -> Drive:
     module, _, function = name.partition(":")
+    sys.path.insert(0, os.getcwd())  # where the command is given; Python has put this file's directory there
     try:
         return getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from scipy.special import softmax
 
@@ -270,6 +271,6 @@ def watch(stored: TrainedAgent, bar: Progress, *, episodes: int = 1, seed: int, 
 
 
 def progress_bar() -> Progress:
-    """Makes progress bars that end with a note."""
+    """Makes progress bars that end with a note, on stderr: stdout has the results."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeRemainingColumn())
-    return Progress(*columns)
+    return Progress(*columns, console=Console(stderr=True))

@@ -205,8 +205,8 @@ def test_a_signal_ends_it_after_the_frame_at_hand(number, path, tmp_path):
     (tmp_path / "slow.py").write_text("import time\ndef drive(natural, vision):\n    time.sleep(0.02)\n")
     words = ["--source", film(tmp_path / "film.avi", 4000), "--drive", "slow:drive", "--log-every", "0"]
     command = [sys.executable, "-u", str(path / "camera.py"), *words]
-    environment = {"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"}
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    environment = {"PATH": "/usr/bin:/bin"}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path)
     assert process.stderr is not None
     try:
         line = process.stderr.readline()
