@@ -95,7 +95,7 @@ def test_a_gif_has_the_same_speed(recording, tmp_path, monkeypatch, capsys):
             image.seek(i)
             durations.append(image.info["duration"])
     assert sum(durations) == pytest.approx(1000 * 20 / 15, abs=10)
-    told = " ".join(capsys.readouterr().out.split())
+    told = " ".join(capsys.readouterr().err.split())
     assert "only the first 20 of 24 steps" in told and "pip install 'foajax[video]'" in told
 
 
