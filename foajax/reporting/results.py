@@ -88,7 +88,7 @@ def _heat(run: RunData) -> heatmap.HeatMap | None:
 
 def _check_gaze(label: str, run: RunData) -> None:
     """Raises `ConfigError` if the gaze of a run that is compared is another than the end of its name says."""
-    kind = run.config.gaze.mode
+    kind: str = run.config.gaze.mode
     if kind == "frozen" and run.config.gaze.start != "centre":
         lowest, middle = heatmap.bounds(run.config)[1][0], run.config.env.frame_shape[1] // 2
         kind = "frozen-low" if run.config.gaze.start == (lowest, middle) else "frozen-elsewhere"
