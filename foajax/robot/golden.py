@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import numpy as np
 
@@ -27,13 +25,12 @@ def record(stored: TrainedAgent, *, seed: int = 0) -> dict[str, np.ndarray]:
       ConfigError: the game cannot be played here.
     """
     environment = games.environment(stored, num_envs=GAMES, seed=seed)
-    act = jax.jit(functools.partial(stored.agent.act, greedy=True))
     state, key = stored.agent.initial_state(GAMES), jax.random.key(seed)
     rows: dict[str, list[np.ndarray]] = {}
     timestep, _ = environment.reset()
     for step in range(STEPS // GAMES):
         now = jax.random.fold_in(key, step)
-        output, network, state = act(stored.params, stored.statistics, state, timestep, now)
+        output, network, state = stored.act(stored.params, stored.statistics, state, timestep, now, greedy=True)
         row = {name: getattr(timestep, name) for name in ("frame", "reward", "is_first")}
         row |= {name: getattr(output, name) for name in ("focal_point", "natural_action", "vision_action")}
         row |= {name: getattr(network, name) for name in ("natural_logits", "vision_logits")}

@@ -142,8 +142,8 @@ def _calls(path: Path, stored: TrainedAgent) -> Calls:
 
 
 def _jax(stored: TrainedAgent, screen: np.ndarray) -> Callable[[], Any]:
-    act, state = jax.jit(stored.agent.act), stored.agent.initial_state(1)
+    state = stored.agent.initial_state(1)
     false = np.zeros(1, bool)
     timestep = TimeStep(screen[None], np.zeros(1, np.float32), is_first=false, is_terminal=false)
     inputs = stored.params, stored.statistics, state, timestep, jax.random.key(0)
-    return lambda: jax.block_until_ready(act(*inputs)[0].natural_action)
+    return lambda: jax.block_until_ready(stored.act(*inputs)[0].natural_action)

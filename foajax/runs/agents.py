@@ -72,7 +72,8 @@ class TrainedAgent:
         return dataclasses.replace(self, agent=dataclasses.replace(self.agent, config=config))
 
     @functools.cached_property
-    def _act(self) -> Callable[..., Any]:
+    def act(self) -> Callable[..., Any]:
+        """`agent.act`, compiled; it keeps nothing."""
         return jax.jit(self.agent.act, static_argnames="greedy")
 
     def reset(self, batch: int = 1, *, seed: int = 0, greedy: bool = False) -> None:
@@ -123,7 +124,7 @@ class TrainedAgent:
             is_terminal=np.zeros(batch, bool),
         )
         said = self.params, self.statistics, self._state, timestep, next(self._keys)
-        output, _, self._state = self._act(*said, greedy=self._greedy)
+        output, _, self._state = self.act(*said, greedy=self._greedy)
         self._starts = np.zeros(batch, bool)
         return Actions(*map(np.asarray, (output.natural_action, output.vision_action, output.focal_point)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -65,7 +64,6 @@ def play(
     num_envs = min(num_envs, episodes)
     rounds = [len(part) for part in np.array_split(np.arange(episodes), num_envs)]
     watched = environment(stored, num_envs=num_envs, seed=seed)
-    act = jax.jit(functools.partial(stored.agent.act, greedy=greedy))
     state = stored.agent.initial_state(num_envs)
     key = jax.random.key(seed)
     returns, lengths, games = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
@@ -74,7 +72,8 @@ def play(
     timestep, _ = watched.reset()
     step = 0
     while len(finished) < episodes:
-        output, _, state = act(stored.params, stored.statistics, state, timestep, jax.random.fold_in(key, step))
+        now = jax.random.fold_in(key, step)
+        output, _, state = stored.act(stored.params, stored.statistics, state, timestep, now, greedy=greedy)
         send(watched, np.asarray(output.natural_action), output.focal_point)
         timestep, outcome = watched.recv()
         returns += outcome.score

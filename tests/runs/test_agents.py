@@ -146,10 +146,10 @@ def test_it_decides_as_the_pure_agent_does(pong, greedy):
 def test_a_reset_compiles_nothing_anew(pong):
     pong.reset(2)
     pong.decide(screens(0))
-    program, compiled = pong._act, pong._act._cache_size()
+    program, compiled = pong.act, pong.act._cache_size()
     pong.reset(2, seed=1)
     pong.decide(screens(1))
-    assert pong._act is program and pong._act._cache_size() == compiled
+    assert pong.act is program and pong.act._cache_size() == compiled
 
 
 def test_it_begins_by_itself_and_says_what_it_cannot_take(pong):
