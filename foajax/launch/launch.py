@@ -78,8 +78,9 @@ def _run(task: Task, check: Callable[[Config], None], arguments: Sequence[str]) 
     if is_sweep:
         if strays := [word for word in rest if not word.startswith(("-", "hydra.", "hydra/"))]:
             raise refuse(one_line(strays[0]))
-        for each in runs:
-            check(each.config)
+        with interrupt_ends():  # this imports JAX, and nothing has begun
+            for each in runs:
+                check(each.config)
     flag = [] if directory is None else [f"--config-dir={directory}"]
     if is_sweep and not set(rest) - {*_MULTIRUN, *jobs}:
         return sweep.run_all(runs, jobs=at_a_time, command=(*sweep.COMMAND, *flag))

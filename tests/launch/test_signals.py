@@ -14,22 +14,26 @@ from processes import TINY, newest, start
 from foajax.runs.agents import load_agent
 
 IN_A_CALLBACK = """
-import gc, os, signal
-from foajax.launch import launch
+import gc, os, runpy, signal, sys
 
-def task(config):
-    gc.callbacks.append(lambda phase, info: os.kill(os.getpid(), signal.SIGINT))
-    gc.collect()
-    print("went on", flush=True)
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "jax":
+            gc.callbacks.append(lambda phase, info: os.kill(os.getpid(), signal.SIGINT))
+            gc.collect()
 
-launch.run(task, ["game=seek"])
+sys.meta_path.insert(0, Interrupt())
+runpy.run_module("foajax.train", run_name="__main__", alter_sys=True)
 """
 
 
-def test_an_interrupt_inside_a_callback_is_heard():
-    """Where Python would print a KeyboardInterrupt, forget it and go on."""
-    process = subprocess.run([sys.executable, "-c", IN_A_CALLBACK], capture_output=True, text=True, timeout=60)
-    assert (process.returncode, process.stdout) == (-signal.SIGINT, "")
+@pytest.mark.parametrize("words", [[], ["seed=0,1", "--multirun"]])
+def test_an_interrupt_while_jax_is_imported_is_heard(tmp_path, words):
+    """In a callback, where Python would print a KeyboardInterrupt, forget it and go on."""
+    command = [sys.executable, "-c", IN_A_CALLBACK, "game=seek", *words]
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (process.returncode, process.stdout, process.stderr) == (-signal.SIGINT, "", "")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
