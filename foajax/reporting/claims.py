@@ -318,6 +318,13 @@ CLAIMS = (
         *(1.0, math.inf, _scores(("constant70_p", "constant70_p-scripted"))),
     ),
     Claim(
+        "A price for moving improves a learned gaze",
+        None,
+        "Score of `constant70_p` where each move of the gaze costs 0.01 of reward in training (`gaze.cost=0.01 "
+        "gaze.cost_per=saccade`), divided by that where moving is free: above 1.",
+        *(1.0, math.inf, _scores(("constant70_p-priced", "constant70_p"))),
+    ),
+    Claim(
         "Packed values score no less than the paper's canvas",
         None,
         "Score of `constant70_p` (packed) divided by that of the same sensor with an 80x80 canvas: above 0.8.",

@@ -32,12 +32,14 @@ _GAZES = {
     "constant70_p-frozen-low": "gaze frozen low",
     "constant70_p-random": "gaze random",
     "constant70_p-scripted": "gaze scripted",
+    "constant70_p-priced": "gaze learned, moving has a price",
 }
 _TIMES = {  # whose score a learned gaze has so many times
     "constant70_p-frozen": "the score of a gaze frozen in the centre",
     "constant70_p-frozen-low": "that of one frozen low",
     "constant70_p-random": "that of a random one",
     "constant70_p-scripted": "that of one that scans the lower half",
+    "constant70_p-priced": "that of a learned one that pays for each move",
 }
 FIGURES: dict[str, tuple[str, Mapping[str, str]]] = {  # title, and whose curves by which names
     "constant": ("constant resolution (Fig. 7)", {name: name for name in PRESETS["constant"]}),
@@ -92,6 +94,8 @@ def _check_gaze(label: str, run: RunData) -> None:
     if kind == "frozen" and run.config.gaze.start != "centre":
         lowest, middle = heatmap.bounds(run.config)[1][0], run.config.env.frame_shape[1] // 2
         kind = "frozen-low" if run.config.gaze.start == (lowest, middle) else "frozen-elsewhere"
+    elif kind == "learned" and run.config.gaze.cost:
+        kind = "priced"
     end = "" if kind in ("learned", "none") else f"-{kind}"
     if label in _COMPARED and end != "".join(label.partition("-")[1:]):
         name = f"{run.config.name.partition('-')[0]}{end}"

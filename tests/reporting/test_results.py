@@ -48,7 +48,7 @@ def heat_of(*points):
 
 LOW, HIGH = [(44, 40)] * 9 + [(45, 41)], [(36, 40)] * 9 + [(45, 40)]
 STILL, RESTLESS = LOW, [(y, x) for y in (35, 45) for x in (35, 45)]
-CONTROLS = [f"constant70_p{what}" for what in ("-frozen", "-frozen-low", "-random", "-scripted", ", canvas")]
+CONTROLS = [f"constant70_p{what}" for what in ("-frozen", "-frozen-low", "-random", "-scripted", "-priced", ", canvas")]
 NAMES = [*curves.PAPER_NAMES, *CONTROLS, "logpolar"]
 # Of each claim: who scores how much, at which pace, where it holds and where it does not; 100 at pace 1 for the others.
 BOTH_WAYS = {
@@ -80,6 +80,7 @@ BOTH_WAYS = {
     ),
     "A learned gaze beats a random one": ({"constant70_p-random": (50, 1)}, {"constant70_p-random": (150, 1)}),
     "A learned gaze beats a scripted one": ({"constant70_p-scripted": (50, 1)}, {"constant70_p-scripted": (150, 1)}),
+    "A price for moving improves a learned gaze": ({"constant70_p-priced": (150, 1)}, {"constant70_p-priced": (50, 1)}),
     "Packed values score no less than the paper's canvas": ({}, {"constant70_p, canvas": (150, 1)}),
     "A log-polar retina scores no less than squares of as many values": ({}, {"logpolar": (50, 1)}),
 }
@@ -295,6 +296,7 @@ def test_a_run_that_is_not_compared_has_no_ratio_and_no_word_on_the_learner(chec
         (["name=constant70_p_packed"], 0, "is of 1,000 env_steps; accepted is 3,000,000"),
         (["gaze=random", "name=decreasing_packed"], 0, "has a random gaze; accepted is name=decreasing_packed-random"),
         (["gaze=frozen", "name=constant70_p_packed-frozen-low"], 0, "a frozen gaze; .*constant70_p_packed-frozen$"),
+        (["gaze.cost=1", "name=decreasing_packed"], 0, "a priced gaze; accepted is name=decreasing_packed-priced$"),
         (["name=constant70_p_packed-frozen-low"], 0, "a learned gaze; accepted is name=constant70_p_packed$"),
         (
             ["gaze=frozen", "gaze.start=[35,40]", "name=constant70_p_packed-frozen-low"],
