@@ -49,9 +49,9 @@ def test_commands_of_what_is_left(capsys):
     assert cli.run(reproduce.reproduce, ["stage=2", "show=commands"]) == 0
     commands = capsys.readouterr().out.splitlines()
     configs = [compose(shlex.split(line.removeprefix("python -m foajax.train "))) for line in commands]
-    assert [config.gaze.mode for config in configs] == ["frozen", "frozen", "random", "scripted", "learned"]
+    assert [config.gaze.mode for config in configs] == ["frozen", "frozen", "random", "scripted", "learned", "learned"]
     assert [config.gaze.start for config in configs[:2]] == ["centre", (45, 40)]
-    assert configs[-1].sensor.layout == "canvas"
+    assert [config.sensor.layout for config in configs[-2:]] == ["canvas", "canvas"]
 
 
 @pytest.mark.slow

@@ -331,6 +331,13 @@ CLAIMS = (
         *(0.8, math.inf, _scores(("constant70_p", "constant70_p, canvas"))),
     ),
     Claim(
+        "Packed rings score no less than the paper's canvas",
+        None,
+        "Score of `decreasing` (packed) divided by that of the same sensor with an 80x80 canvas: above 0.8. Packed, "
+        "each ring is an image of its own, and the outer one gives 64 of 1,664 features; a canvas is one image.",
+        *(0.8, math.inf, _scores(("decreasing", "decreasing, canvas"))),
+    ),
+    Claim(
         "A log-polar retina scores no less than squares of as many values",
         None,
         "Score of `logpolar` divided by that of `constant70` (1225 values each): above 0.8. The focal point of "

@@ -47,7 +47,7 @@ FIGURES: dict[str, tuple[str, Mapping[str, str]]] = {  # title, and whose curves
     "peripheral": ("peripheral vision (Fig. 9)", {name: name for name in PRESETS["peripheral"]}),
     "gaze": ("the whole frame, and a fifth of it", _GAZES),
 }
-_COMPARED = {*PAPER_NAMES, *_GAZES, "logpolar", "constant70_p, canvas"}
+_COMPARED = {*PAPER_NAMES, *_GAZES, "logpolar", "constant70_p, canvas", "decreasing, canvas"}
 _AXES = {"env_steps": (1e6, "million decisions"), "time": (3600.0, "core hours")}
 
 

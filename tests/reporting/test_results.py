@@ -49,7 +49,7 @@ def heat_of(*points):
 LOW, HIGH = [(44, 40)] * 9 + [(45, 41)], [(36, 40)] * 9 + [(45, 40)]
 STILL, RESTLESS = LOW, [(y, x) for y in (35, 45) for x in (35, 45)]
 CONTROLS = [f"constant70_p{what}" for what in ("-frozen", "-frozen-low", "-random", "-scripted", "-priced", ", canvas")]
-NAMES = [*curves.PAPER_NAMES, *CONTROLS, "logpolar"]
+NAMES = [*curves.PAPER_NAMES, *CONTROLS, "decreasing, canvas", "logpolar"]
 # Of each claim: who scores how much, at which pace, where it holds and where it does not; 100 at pace 1 for the others.
 BOTH_WAYS = {
     "Lower resolution at 50x50 hurts": ({"constant50_sub2": (50, 1)}, {"constant50_sub2": (150, 1)}),
@@ -82,6 +82,7 @@ BOTH_WAYS = {
     "A learned gaze beats a scripted one": ({"constant70_p-scripted": (50, 1)}, {"constant70_p-scripted": (150, 1)}),
     "A price for moving improves a learned gaze": ({"constant70_p-priced": (150, 1)}, {"constant70_p-priced": (50, 1)}),
     "Packed values score no less than the paper's canvas": ({}, {"constant70_p, canvas": (150, 1)}),
+    "Packed rings score no less than the paper's canvas": ({}, {"decreasing, canvas": (150, 1)}),
     "A log-polar retina scores no less than squares of as many values": ({}, {"logpolar": (50, 1)}),
 }
 GAZES = {"The gaze stays in the lower half": (LOW, HIGH), "The gaze moves little": (STILL, RESTLESS)}
