@@ -45,7 +45,7 @@ PAPER_NAMES = {
     "decreasing_p": "Decreasing(P) 30-50-70",
 }
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444", "#8c6d31")
-_LINES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))  # tell lines of one colour apart
+_LINES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (8, 3)))  # tell lines of one colour apart
 _POINTS = 300  # of a curve
 AXES = {"env_steps": (1e6, "million agent steps"), "time": (3600.0, "hours of training")}
 _LABEL_GAP = 0.085  # between labels at the lines' ends, of the axis's height

@@ -32,7 +32,7 @@ _GAZES = {
     "constant70_p-frozen-low": "gaze frozen low",
     "constant70_p-random": "gaze random",
     "constant70_p-scripted": "gaze scripted",
-    "constant70_p-priced": "gaze learned, moving has a price",
+    "constant70_p-priced": "gaze learned at a price",
 }
 _TIMES = {  # whose score a learned gaze has so many times
     "constant70_p-frozen": "the score of a gaze frozen in the centre",
@@ -297,7 +297,8 @@ def block(games: Mapping[str, Game], costs: Sequence[Mapping[str, Any]]) -> str:
     )
     text = (
         f"On Breakout a learned gaze scores {learned / whole:.2f} of what an agent scores that sees the whole frame, "
-        f"from a fifth of its pixel values. It has {', '.join(first) + ' and ' if first else ''}{last}.{_best(game)}"
+        f"from a fifth of its pixel values. It has {', '.join(first) + ' and ' if first else ''}{last}."
+        f"{_canvas(game)}{_best(game)}"
     )
     rows = []
     for label in there:
@@ -328,6 +329,15 @@ def _verdicts_in_words(game: Game) -> str:
         f"{len(verdicts) - yes - no - missing}{', as far as so few seeds can tell' if few else ''}."
         + (f" Runs for {missing} are missing." if missing else "")
     )
+
+
+def _canvas(game: Game) -> str:
+    """Says what a learned gaze scores on the paper's canvas; "" before that was run."""
+    label = "constant70_p, canvas"
+    if label not in game.runs:
+        return ""
+    share = _worth(game, label).value / _worth(game, "nonfoa").value
+    return f" On the paper's canvas a learned gaze has {share:.2f} of the whole frame's score."
 
 
 def _best(game: Game) -> str:

@@ -272,6 +272,14 @@ def test_the_readme_compares_with_a_gaze_frozen_low_too(checkout):
     assert "| gaze frozen low (`constant70_p_packed-frozen-low`) |" in block
 
 
+def test_the_readme_says_what_the_canvas_scores(checkout):
+    runs = checkout / "results/runs"
+    assert "canvas" not in results.block(results.by_game(kept.runs(runs)), [])
+    keep_run(runs, ["game=breakout", "experiment=constant70_p"], 60)
+    words = " ".join(results.block(results.by_game(kept.runs(runs)), []).split())
+    assert "On the paper's canvas a learned gaze has 0.49 of the whole frame's score." in words  # 58.3 of 118.3
+
+
 def test_without_runs_the_readme_says_so():
     assert "not run yet" in results.page({}, []) and results.block({}, []) == "Not run yet.\n"
 
