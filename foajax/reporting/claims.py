@@ -334,7 +334,7 @@ CLAIMS = (
         "Packed rings score no less than the paper's canvas",
         None,
         "Score of `decreasing` (packed) divided by that of the same sensor with an 80x80 canvas: above 0.8. Packed, "
-        "each ring is an image of its own, and the outer one gives 64 of 1,664 features; a canvas is one image.",
+        "each ring is an image of its own, and the outer one gives few of the features; a canvas is one image.",
         *(0.8, math.inf, _scores(("decreasing", "decreasing, canvas"))),
     ),
     Claim(
